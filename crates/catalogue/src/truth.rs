@@ -249,11 +249,14 @@ fn row_of<'n>(
     for name in names {
         all.push(name);
         let own = parts(Path::new(name));
+        if own.is_empty() {
+            continue;
+        }
         let part = |parts: &Vec<_>| parts.windows(own.len()).any(|some| some == own);
         // A folder above that of the command is no part of a relative path.
         let is_absolute = Path::new(name).is_absolute();
         let fits = same.iter().any(part) || is_absolute && same_absolute.iter().any(part);
-        if own.is_empty() || own.len() < length || !fits {
+        if own.len() < length || !fits {
             continue;
         }
         if own.len() > length {
