@@ -237,7 +237,10 @@ def _of_one_length(table: Mapping[Any, Any]) -> list[tuple[Any, Any]]:
         return list(table.items())
     found = [(name, column) for name, column in table.items() if column is not None]
     rows = next((len(column) for _, column in found if np.ndim(column) > 0), None)
-    is_single = lambda value: np.ndim(value) == 0 and isinstance(value, (str, bool, int, float, np.bool_, np.number))
+
+    def is_single(value: Any) -> bool:
+        return np.ndim(value) == 0 and isinstance(value, (str, bool, int, float, np.bool_, np.number))
+
     return [(name, np.full(rows, column) if rows is not None and is_single(column) else column) for name, column in found]
 
 
