@@ -269,7 +269,7 @@ pub enum Warning {
     },
     /// Pixels of the PSF have another value than the pixels around them allow.
     #[error(
-        "pixels of the PSF hold no light (found {}{of}; expected a smooth PSF). A dead pixel changes c by up to 0.01, a dead row m by 0.15, a hot pixel or a core cut at 0.9 of its peak m by 0.02. Try: a model of the PSF, or stars without saturation and bad pixels",
+        "pixels of the PSF are not those of a star (found {}{of}; expected a smooth PSF). Dead pixels bias c by up to 0.01, dead rows m by 0.15, hot pixels m by 0.02, cores cut at 0.9 of the peak m by 0.02, at 0.7 by 0.08. Try: a model of the PSF, or other stars",
         match (*dead, *hot) {
             (0, 0) => "several pixels of the brightest value".to_owned(),
             (0, hot) => format!("{hot} much brighter than those around them, {distance:.0} px from the centre"),

@@ -9,9 +9,9 @@ pub(super) const LANES: usize = 32;
 pub(super) const PAIRS: [(isize, isize); 6] = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2)];
 // Largest −ln R_d/(|d|² p_max) of 22 PSFs (Moffat of FWHM 1 to 5 px, Kolmogorov of e = 0.28, Airy of λ/D 0.8 to 3 px, Euclid VIS and NISP, Roman)
 // without the margin. Gaussians have π. Strong coma with a peak of a third of an Airy disc has 22.
-pub(super) const RATIO_EXPONENT: f32 = 12.0;
+const RATIO_EXPONENT: f32 = 12.0;
 // Chosen by hand: Poisson noise of cores changes the ratio, and so do errors of the PSF.
-pub(super) const RATIO_MARGIN: f32 = 1.5;
+const RATIO_MARGIN: f32 = 1.5;
 // Peak of a PSF of sum one below which its pixels show its ratios: FWHM of 2.8 px or more of Moffat PSFs. At other phases those to opposite pixels are at most
 // 1.25 times as large, which the margin covers; a star of FWHM 1.5 px falls eight times as steeply as its pixels show.
 pub(super) const MAX_SAMPLED_PEAK: f64 = 0.07;
@@ -41,6 +41,11 @@ pub(crate) struct LightLimits {
     pub(super) lobe: f32,
 }
 
+// exp(|d|² RATIO_EXPONENT p_max) of each pair.
+fn bounds(peak: f32) -> [f32; PAIRS.len()] {
+    PAIRS.map(|(x, y)| (RATIO_EXPONENT * peak * (x * x + y * y) as f32).exp())
+}
+
 impl LightLimits {
     /// For a PSF of sum one.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
@@ -53,11 +58,8 @@ impl LightLimits {
         } else {
             ([f64::INFINITY; PAIRS.len()], [f64::INFINITY; DIRECTIONS])
         };
-        let ratios = std::array::from_fn(|k| {
-            let (x, y) = PAIRS[k];
-            let bound = (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp();
-            RATIO_MARGIN * bound.min(pairs[k] as f32)
-        });
+        let bounds = bounds(high as f32);
+        let ratios = std::array::from_fn(|k| RATIO_MARGIN * bounds[k].min(pairs[k] as f32));
         let steepness = steps.map(|step| STEEPNESS_MARGIN * step as f32);
         LightLimits {
             ratios,
@@ -70,8 +72,7 @@ impl LightLimits {
 
     /// For any PSF of sum one with this peak.
     pub(super) fn from_peak(peak: f32) -> Self {
-        let ratios = PAIRS
-            .map(|(x, y)| RATIO_MARGIN * (RATIO_EXPONENT * peak * (x * x + y * y) as f32).exp());
+        let ratios = bounds(peak).map(|bound| RATIO_MARGIN * bound);
         LightLimits {
             ratios,
             noise: ratios.map(ratio_noise),

@@ -809,6 +809,38 @@ mod tests {
         }
     }
 
+    // An Airy disc of λ/D in pixels, on a centre or a corner, with an obscuration. Pixels are integrated over 5 × 5 points: on one
+    // point, a ring may have no light at all.
+    fn obscured(lambda_over_d: f64, obscuration: f64, side: usize) -> Array2<f64> {
+        let middle = (side as f64 - 1.0) / 2.0;
+        let disc = |x: f64| 2.0 * puruspe::bessel::Jn(1, x) / x;
+        let light = |x: f64, y: f64| {
+            let r = (x - middle).hypot(y - middle);
+            let x = (std::f64::consts::PI * r / lambda_over_d).max(1e-6);
+            (disc(x) - obscuration.powi(2) * disc(obscuration * x)).powi(2)
+        };
+        let points = [-0.4, -0.2, 0.0, 0.2, 0.4];
+        Array2::from_shape_fn((side, side), |(y, x)| {
+            let row = |dy: f64| points.map(|dx| light(x as f64 + dx, y as f64 + dy));
+            points.iter().flat_map(|dy| row(*dy)).sum()
+        })
+    }
+
+    #[test]
+    fn dark_rings_are_no_defects() {
+        for lambda_over_d in [2.5, 2.8, 3.0, 3.2, 3.5, 4.0] {
+            for obscuration in [0.1, 0.3, 0.5] {
+                for side in [48, 49, 64, 65] {
+                    let psf = obscured(lambda_over_d, obscuration, side);
+                    let found = PsfQuality::from_psf((&psf / psf.sum()).view(), None).unwrap();
+                    let defects = (found.dead, found.hot, found.is_cut);
+                    let case = (lambda_over_d, obscuration, side);
+                    assert_eq!(defects, (0, 0, false), "{case:?}");
+                }
+            }
+        }
+    }
+
     #[test]
     fn clean_psfs_have_no_defects() {
         let mut rng = ChaCha8Rng::seed_from_u64(8);
