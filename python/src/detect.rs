@@ -68,13 +68,11 @@ pub(crate) fn detect<'py>(
         let values: Vec<i32> = found.iter().map(|own| of(own) as i32).collect();
         columns.set_item(name, values.into_pyarray(py))?;
     }
-    let sky = SkyLevel::of(image.iter().enumerate().map(|(at, value)| {
-        let place = [
-            (at % width) as f64 / width as f64,
-            (at / width) as f64 / height as f64,
-        ];
-        (place, *value)
-    }));
+    let sky = SkyLevel::of(width * height, |at| {
+        let (x, y) = (at % width, at / width);
+        let place = [x as f64 / width as f64, y as f64 / height as f64];
+        (place, image[[y, x]])
+    });
     let mut doubts = doubts(star, sky, noise, None);
     doubts.extend(unlit_in_words(unlit));
     Ok((columns, doubts))

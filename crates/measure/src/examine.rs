@@ -17,7 +17,7 @@ use crate::error::MeasureError;
 use crate::moments::{
     CENTROID_WEIGHT_SIGMA, CORE_RADIUS_PX, CoreSize, core_sums, galaxy_centroid_near,
 };
-use crate::pixels::{PEAK_RANGE, Pixel, highest};
+use crate::pixels::{PEAK_RANGE, Pixel, all_finite, highest};
 use crate::psf::{PsfQuality, Psfs, Star, psf_warnings};
 use crate::random::hash;
 use crate::sky::{INNER_AREA, INNER_RADIUS, inner_light};
@@ -351,6 +351,7 @@ impl Examination {
             shared([[&columns[0], &columns[2]], [&columns[1], &columns[3]]]),
         ];
         let corner = median_ignoring_nan(&mut corners.map(|corner| corner.mean));
+        let is_whole = all_finite(pixels);
         let border = StampStatistics {
             at: self.added - 1,
             corner,
@@ -366,8 +367,9 @@ impl Examination {
             flux: 0.0,
             core: [0.0; 2],
             // The centroid or the narrow weight depends on them.
-            is_core_damaged: missing_near(pixels, n, place, CORE_RADIUS_PX)[0] > 0,
-            is_masked: matches!(missing_near(pixels, n, place, MASKED_RADIUS_PX), [missing, of] if missing == of && of > 0),
+            is_core_damaged: !is_whole && missing_near(pixels, n, place, CORE_RADIUS_PX)[0] > 0,
+            is_masked: !is_whole
+                && matches!(missing_near(pixels, n, place, MASKED_RADIUS_PX), [missing, of] if missing == of && of > 0),
             darkest_share,
             brightest,
         };
@@ -643,13 +645,11 @@ impl Examination {
     /// Compares the scatter of the slopes over stamps with that of the difference across: noise of any correlation that is shorter than the
     /// stamp makes them equal, and so do the wings of galaxies.
     fn sky_slopes(&self, noise: f64, flux: f64) -> Option<Warning> {
-        let square = |of: &dyn Fn(&StampStatistics) -> f64| {
-            let Estimate { error, .. } = self.median(of, 0.0);
-            (error / OF_MEDIAN).powi(2) * self.stamps.len() as f64
-        };
-        let slopes = [0, 1].map(|k| square(&|stamp| stamp.slope[k]));
-        let (of_slopes, of_noise) = (0.5 * (slopes[0] + slopes[1]), square(&|stamp| stamp.saddle));
-        let count = self.stamps.len() as f64;
+        let (x, count) = self.scatter_of(|stamp| stamp.slope[0])?;
+        let (y, _) = self.scatter_of(|stamp| stamp.slope[1])?;
+        let (across, _) = self.scatter_of(|stamp| stamp.saddle)?;
+        let (of_slopes, of_noise) = (0.5 * (x * x + y * y), across * across);
+        let count = count as f64;
         let excess = Estimate {
             value: of_slopes - of_noise,
             error: SQUARED_SCATTER_ERROR * (0.5 * of_slopes.powi(2) + of_noise.powi(2)).sqrt()
@@ -673,12 +673,9 @@ impl Examination {
         if !found.is_significant() || correlation < LONG_CORRELATION {
             return None;
         }
-        let spread = |of: fn(&StampStatistics) -> f64| {
-            let mut all: Vec<f64> = self.stamps.iter().map(of).collect();
-            all.retain(|level| level.is_finite());
-            scatter(&mut all).map(|(_, scatter)| scatter / noise)
-        };
-        let (levels, of_sides) = (spread(|stamp| stamp.corner)?, spread(|stamp| stamp.side)?);
+        let (corners, _) = self.scatter_of(|stamp| stamp.corner)?;
+        let (sides, _) = self.scatter_of(|stamp| stamp.side)?;
+        let (levels, of_sides) = (corners / noise, sides / noise);
         // The median of four corners is about the mean of two.
         let of_noise = 0.5 / (self.block * self.block) as f64;
         // The wings of galaxies are fainter in the corners.
@@ -688,6 +685,13 @@ impl Examination {
         }
         // Wings of galaxies without noise have more power than the fits that remove them leave for noise.
         (correlation < 1.0).then_some(Warning::LongCorrelation { correlation })
+    }
+
+    /// The scatter over stamps, and the number of those that have the quantity.
+    fn scatter_of(&self, of: fn(&StampStatistics) -> f64) -> Option<(f64, usize)> {
+        let mut all: Vec<f64> = self.stamps.iter().map(of).collect();
+        all.retain(|own| own.is_finite());
+        scatter(&mut all).map(|(_, scatter)| (scatter, all.len()))
     }
 
     /// The mean over stamps, each within 3 standard deviations of the median.

@@ -125,11 +125,12 @@ pub struct SkyLevel {
 }
 
 impl SkyLevel {
-    /// From some of the `pixels`, with their places in units of the sides of the exposure; `None` if all are missing.
-    pub fn of(pixels: impl ExactSizeIterator<Item = ([f64; 2], f32)>) -> Option<Self> {
-        let every = pixels.len().div_ceil(SAMPLE).max(1);
+    /// From some of `count` pixels, with their places in units of the sides of the exposure; `None` if all are missing.
+    pub fn of(count: usize, pixel: impl Fn(usize) -> ([f64; 2], f32)) -> Option<Self> {
+        let every = count.div_ceil(SAMPLE).max(1);
+        let pixels = (0..count).step_by(every).map(pixel);
         let mut parts = vec![Vec::new(); SKY_PARTS * SKY_PARTS];
-        for (place, value) in pixels.step_by(every).filter(|(_, own)| own.is_finite()) {
+        for (place, value) in pixels.filter(|(_, own)| own.is_finite()) {
             let [x, y] = place.map(|at| ((SKY_PARTS as f64 * at) as usize).min(SKY_PARTS - 1));
             parts[y * SKY_PARTS + x].push(f64::from(value));
         }
@@ -368,13 +369,12 @@ impl DetectionTask<'_> {
         let metadata = self.metadata((run, id), print, &level, (frame, &wcs))?;
         table::write(&path, run.format, &columns, &metadata)?;
         let sigma = level.noise.sigma();
-        let per_row = grid(sides[0]).count();
-        let rows = (sample.len() / (NOISE_STAMP * NOISE_STAMP)).div_ceil(per_row);
-        let sky = SkyLevel::of(sample.iter().enumerate().map(|(at, value)| {
-            let stamp = at / (NOISE_STAMP * NOISE_STAMP);
+        let [per_row, rows] = sides.map(|side| grid(side).count());
+        let sky = SkyLevel::of(sample.len(), |at| {
+            let stamp = at / STAMP_PIXELS;
             let [x, y] = [stamp % per_row, stamp / per_row].map(|at| at as f64);
-            ([x / per_row as f64, y / rows as f64], *value)
-        }));
+            ([x / per_row as f64, y / rows as f64], sample[at])
+        });
         let mut doubts = doubts(star.view(), sky, sigma, level.measured);
         doubts.extend(unlit_in_words(unlit));
         Ok(Detected {
@@ -546,6 +546,7 @@ impl DetectionTask<'_> {
 // of 10⁻³.
 const NOISE_GRID: usize = 32;
 const NOISE_STAMP: usize = 48;
+const STAMP_PIXELS: usize = NOISE_STAMP * NOISE_STAMP;
 // Largest distance of pixels that may be correlated, as `48/linear/star` has it.
 const MAX_LAG: usize = 3;
 
@@ -589,7 +590,7 @@ fn unmeasured(exposure: &Exposure<'_>) -> FileError {
 
 fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise, PipelineError> {
     let mut survey = NoisePlan::new(NOISE_STAMP, MAX_LAG, None)?.survey();
-    for stamp in stamps.chunks_exact(NOISE_STAMP * NOISE_STAMP) {
+    for stamp in stamps.chunks_exact(STAMP_PIXELS) {
         if let Ok(stamp) = ArrayView2::from_shape((NOISE_STAMP, NOISE_STAMP), stamp) {
             survey.add(stamp)?;
         }
@@ -657,14 +658,13 @@ mod tests {
     fn a_sky_that_differs_between_parts_is_named() {
         let words = |sky: &dyn Fn(f64, f64) -> f64| {
             const SIDE: usize = 300;
-            let pixels = (0..SIDE * SIDE).map(|at| {
+            let pixel = |at: usize| {
                 let [x, y] = [at % SIDE, at / SIDE].map(|at| at as f64 / SIDE as f64);
                 // Uniform noise of σ = 1.
                 let noise = 12f64.sqrt() * ((at as f64 * 0.618_033_988_75).fract() - 0.5);
                 ([x, y], (noise + sky(x, y)) as f32)
-            });
-            let pixels: Vec<_> = pixels.collect();
-            let found = SkyLevel::of(pixels.into_iter()).and_then(|sky| sky.doubts(1.0));
+            };
+            let found = SkyLevel::of(SIDE * SIDE, pixel).and_then(|sky| sky.doubts(1.0));
             found.unwrap_or_default()
         };
         for (sky, expected) in [
