@@ -1428,3 +1428,38 @@ fn galaxies_that_select_left_out_do_not_count() {
     assert_has(&notes, "rows with a weight of zero or less");
     assert!(number(&found["rows"][0], "n") < 128.0, "{found}");
 }
+
+#[test]
+fn ellipticities_of_the_psf_turn_with_those_of_galaxies() {
+    let folder = Folder::new();
+    for (name, sign) in [("right", 1.0), ("mirrored", -1.0)] {
+        pair(&folder, name, 0.02, |g, normal| {
+            let mut text = "id,e1,e2,R11,R22,psf_e1,psf_e2,g1,g2\n".to_owned();
+            for id in 0..GALAXIES {
+                let (noise, psf) = (normal.pair(0.2), normal.pair(0.05));
+                let e = [0, 1].map(|k| g + noise[k] + [0.1, 0.3][k] * psf[k]);
+                let [e2, psf2] = [e[1], psf[1]].map(|x| sign * x);
+                let [e1, psf1] = [e[0], psf[0]];
+                writeln!(text, "{id},{e1},{e2},1,1,{psf1},{psf2},{g},{g}").unwrap();
+            }
+            text
+        });
+    }
+    let found = ["right", "mirrored"].map(|name| {
+        let columns = match name {
+            "mirrored" => "--columns e2=-e2",
+            _ => "",
+        };
+        let line = format!("{name}-plus.csv {name}-minus.csv {columns}");
+        rows(&folder, &line)[0].clone()
+    });
+    for (key, expected) in [("alpha1", 0.1), ("alpha2", 0.3)] {
+        let [right, mirrored] = found.each_ref().map(|row| number(row, key));
+        // Their errors are 0.2/0.05/√4000 = 0.06.
+        assert!((right - expected).abs() < 0.2, "{key}: {right}");
+        assert!(
+            (mirrored - right).abs() < 1e-12,
+            "{key}: {right} {mirrored}"
+        );
+    }
+}

@@ -191,8 +191,7 @@ impl Survey {
         }
         let formula = Expression::parse(stated).ok()?;
         let columns: Vec<&str> = formula.columns().collect();
-        let computes = columns.iter().all(|name| there(name).is_some())
-            && (!formula.is_number() || may_be_number(key.0));
+        let computes = computes(&formula, key.0, |name| there(name).is_some());
         let renamed = |name: &str| {
             let own = there(name).filter(|own| columns.contains(&name) && *own != name);
             own.map(str::to_owned)
@@ -207,8 +206,16 @@ pub fn may_be_number(role: Role) -> bool {
     [R11, R22, R12, R21, M, C1, C2, G1, G2, RmsE, SigmaE, PsfSize].contains(&role)
 }
 
-// Whether a formula has such an operand.
-fn has_operand(formula: &str, is_wanted: impl Fn(&str) -> bool) -> bool {
+/// Whether a role may have a formula: its columns are there, or it is a number that all galaxies may have.
+pub fn computes(formula: &Expression, role: Role, is_there: impl FnMut(&str) -> bool) -> bool {
+    match formula.is_number() {
+        true => may_be_number(role),
+        false => formula.columns().all(is_there),
+    }
+}
+
+/// Whether a formula has such an operand.
+pub fn has_operand(formula: &str, is_wanted: impl Fn(&str) -> bool) -> bool {
     Expression::parse(formula).is_ok_and(|own| own.columns().any(is_wanted))
 }
 
@@ -358,20 +365,14 @@ impl Names {
     /// The columns and formulas of a table with the columns `found`, which may lack the columns of others.
     pub fn within(&self, found: &[String]) -> Self {
         let is_there = |name: &str| found.iter().any(|own| own == name);
-        let is_computed = |text: &str| {
-            let formula = Expression::parse(text);
-            formula.is_ok_and(|own| !own.operands().is_empty() && own.columns().all(is_there))
-        };
         let is_list =
             |(role, _): &Key, text: &str| *role == Role::Flag && text.split('+').all(is_there);
         let mut own = self.clone();
         own.given.retain(|key, name| {
-            let is_number = || Expression::parse(name).is_ok_and(|own| own.is_number());
-            may_be_number(key.0) && is_number()
-                || name == "none"
+            name == "none"
                 || is_there(name)
                 || is_list(key, name)
-                || is_computed(name)
+                || Expression::parse(name).is_ok_and(|own| computes(&own, key.0, is_there))
         });
         own
     }
@@ -608,6 +609,11 @@ impl Columns {
             columns.find_unused(found, names);
         }
         Ok(columns)
+    }
+
+    /// The ellipticities of other methods, which are not used.
+    pub fn others(&self) -> impl Iterator<Item = &String> {
+        self.others.iter().flatten()
     }
 
     /// The public catalogue or the program that wrote it.
@@ -876,10 +882,16 @@ fn chosen_pair<'f>(
         }
     };
     let first = pairs.first()?;
-    let chosen = pairs.iter().find(responds).unwrap_or(first);
     // Of one method, the order of the names decides.
-    let is_other = !method_of(chosen[0]).eq_ignore_ascii_case(method_of(first[0]));
-    Some(if is_other { *chosen } else { *first })
+    let is_other =
+        |own: &&[&String; 2]| !method_of(own[0]).eq_ignore_ascii_case(method_of(first[0]));
+    Some(
+        *pairs
+            .iter()
+            .find(responds)
+            .filter(is_other)
+            .unwrap_or(first),
+    )
 }
 
 // Whether a name is one of the role, perhaps with the prefix of a method.
@@ -917,9 +929,10 @@ fn of_method<'f>(
         R11 | R12 | R21 | R22 if is_unsheared => {
             let prefixed = names.iter().filter(|name| method_of(name).is_empty());
             let mut prefixed = prefixed.map(|name| format!("{own}_{name}"));
-            let own_column = prefixed
-                .find_map(|name| free(&name))
-                .filter(|_| !own.is_empty());
+            let own_column = match own.is_empty() {
+                true => None,
+                false => prefixed.find_map(|name| free(&name)),
+            };
             own_column.or_else(|| {
                 all.find(|name| {
                     let method = method_of(name);
@@ -1221,7 +1234,8 @@ impl Columns {
         let mut unused = self.unused.iter();
         let response = unused.find(|name| {
             let is_clear = !in_capitals.contains(name) && !is_secondary(name);
-            is_clear && is_like_a_response(name) && sheared_name(name).is_none()
+            let is_of_method = method_of(name).eq_ignore_ascii_case(method_of(e1));
+            is_clear && is_of_method && is_like_a_response(name) && sheared_name(name).is_none()
         });
         let response = response.filter(|_| may_have_response && self.survey.is_none())?;
         Some(format!(
@@ -1677,7 +1691,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_belong_to_their_method() {
+    fn weights_and_responses_belong_to_their_method() {
         // Derivatives of a weight that is there are not those of another one.
         for (columns, weight, derivative) in [
             ("weight wdet dwdet_dg1 dwdet_dg2", "weight", None),
@@ -1697,6 +1711,11 @@ mod tests {
             let roles = (own.of(Role::Weight), own.of(Role::Dw1));
             assert_eq!(roles, (Some(weight), derivative));
         }
+        let own = found("wmom_g_1 wmom_g_2 wmom_R11 wmom_R22", &[]).unwrap();
+        assert_eq!(
+            (own.of(Role::E1), own.of(Role::R11)),
+            (Some("wmom_g_1"), Some("wmom_R11"))
+        );
         let mixed = "mcal_g_1 mcal_g_2 mcal_R11 R11 R22";
         assert!(found(mixed, &[]).unwrap_err().contains("none for R22"));
         let own = found("fpfs_e1 fpfs_e2 w fpfs_w", &[]).unwrap();

@@ -32,8 +32,6 @@ pub struct Expression {
     sharp: bool,
     // What `cos` and `sin` are of.
     angles: Vec<Node>,
-    // Operands that are compared with others than a number.
-    compared: Vec<usize>,
 }
 
 /// What an expression reads in each row: the number in a column, or what the text in it is compared with.
@@ -113,7 +111,9 @@ impl Operand {
     pub fn of_number(&self, number: f64) -> f64 {
         match (&self.integers, self.mask) {
             (Some(_), _) if number.is_nan() => f64::NAN,
-            // A number between two integers is equal to none, and compares with large ones as the integer below.
+            // A number between two integers is none of them.
+            (Some(Integers::List(_)), _) if number.fract() != 0.0 => 0.0,
+            // Those of 2⁵³ and more, with which it is compared, have no fraction.
             (Some(integers), _) => integers.value(number.floor() as i128),
             (None, mask) => mask.map_or(number, |mask| common_bits(number, mask as f64)),
         }
@@ -259,7 +259,6 @@ impl Expression {
             root: Node::Operand(0),
             sharp: true,
             angles: Vec::new(),
-            compared: Vec::new(),
         }
     }
 
@@ -278,23 +277,33 @@ impl Expression {
         self.operands.is_empty()
     }
 
-    /// Whether the expression has the other sign of what it is a formula of: it begins with a minus, or is a negative multiple of a
-    /// column.
-    pub fn is_negative(&self) -> bool {
-        let at = |x: f64| self.value(&|_| x);
-        let is_multiple = self.operands.len() == 1
-            && [-1.0, 0.5, 2.0].iter().all(|x| at(*x) == x * at(1.0))
-            && at(1.0) < 0.0;
-        self.operands.iter().all(Operand::is_plain) && (is_multiple || self.text.starts_with('-'))
+    /// Whether the expression falls with a column through zero, whatever small positive numbers the other columns have: those may be
+    /// divisors and angles.
+    pub fn falls_with(&self, column: &str) -> bool {
+        [0.1, 0.3, 0.6].iter().all(|other| {
+            let at = |x: f64| {
+                self.value(&|k| {
+                    if self.operands[k].column == column {
+                        x
+                    } else {
+                        *other
+                    }
+                })
+            };
+            at(0.05) < at(-0.05)
+        })
     }
 
-    /// The columns whose numbers are compared with others than a number, or are the expression itself.
-    pub fn compared_columns(&self) -> impl Iterator<Item = &str> {
-        let compared = self
-            .compared
-            .iter()
-            .map(|place| &self.operands[*place].column);
-        compared.map(String::as_str).chain(self.column())
+    /// The columns of whose numbers the expression needs more digits than floats of large integers have: all but those that are compared
+    /// with a smaller number, or are the expression itself.
+    pub fn exact_columns(&self) -> Vec<&str> {
+        let mut places = Vec::new();
+        if self.column().is_none() {
+            self.root.exact(&mut places);
+        }
+        let operands = places.iter().map(|place| &self.operands[*place]);
+        let plain = operands.filter(|own| own.is_plain());
+        plain.map(|own| own.column.as_str()).collect()
     }
 
     /// The column, if the expression is nothing else.
@@ -376,6 +385,27 @@ impl Node {
         }
     }
 
+    // Operands but those that are compared with a number that floats contain.
+    fn exact(&self, places: &mut Vec<usize>) {
+        match self {
+            Node::Number(_) | Node::Integer(_) | Node::Step(_) => {}
+            Node::Operand(place) => places.push(*place),
+            Node::Unary(_, a) => a.exact(places),
+            Node::Binary(operator, a, b) => {
+                let is_comparison = OPERATORS[COMPARISONS].iter().any(|own| own.0 == operator.0);
+                match (&**a, &**b) {
+                    (Node::Operand(_), Node::Number(number))
+                    | (Node::Number(number), Node::Operand(_))
+                        if is_comparison && number.abs() < MAX_EXACT_INTEGER => {}
+                    (a, b) => {
+                        a.exact(places);
+                        b.exact(places);
+                    }
+                }
+            }
+        }
+    }
+
     fn has_step(&self) -> bool {
         match self {
             Node::Number(_) | Node::Integer(_) | Node::Operand(_) => false,
@@ -423,7 +453,6 @@ impl Condition {
             operands: Vec::new(),
             sharp: false,
             angles: Vec::new(),
-            compared: Vec::new(),
         };
         let root = parser.level(0)?;
         if !parser.rest().is_empty() {
@@ -441,7 +470,6 @@ impl Condition {
             root,
             sharp: parser.sharp,
             angles: parser.angles,
-            compared: parser.compared,
         });
         Ok(Condition { text, rows, steps })
     }
@@ -454,7 +482,6 @@ struct Parser<'a> {
     operands: Vec<Operand>,
     sharp: bool,
     angles: Vec<Node>,
-    compared: Vec<usize>,
 }
 
 impl<'a> Parser<'a> {
@@ -564,24 +591,17 @@ impl<'a> Parser<'a> {
             ">" => "<",
             equal => equal,
         };
-        let (place, token, integer) = match (&a, &b) {
-            (Node::Operand(place), Node::Integer(integer)) => (*place, operator.0, *integer),
-            (Node::Integer(integer), Node::Operand(place)) => (*place, turned, *integer),
-            (a, b) => {
-                for (own, other) in [(a, b), (b, a)] {
-                    if let Node::Operand(place) = own
-                        && !matches!(other, Node::Number(_))
-                    {
-                        self.compared.push(*place);
-                    }
-                }
-                return Node::Binary(operator, Box::new(a.clone()), Box::new(b.clone()));
-            }
+        let with_integer = match (&a, &b) {
+            (Node::Operand(place), Node::Integer(integer)) => Some((*place, operator.0, *integer)),
+            (Node::Integer(integer), Node::Operand(place)) => Some((*place, turned, *integer)),
+            _ => None,
+        };
+        let Some((place, token, integer)) =
+            with_integer.filter(|(place, ..)| self.operands[*place].is_plain())
+        else {
+            return Node::Binary(operator, Box::new(a), Box::new(b));
         };
         let own = self.operands[place].clone();
-        if !own.is_plain() {
-            return Node::Binary(operator, Box::new(a), Box::new(b));
-        }
         // The number itself is not read for a comparison alone.
         self.operands.truncate(place.max(first));
         self.operand(Operand {
@@ -870,14 +890,14 @@ pub fn has_long_integers(frame: &DataFrame, name: &str) -> bool {
     integers_of(frame, name).is_some_and(|mut all| all.any(|own| own.is_some_and(is_long)))
 }
 
-/// Refuses columns of integers that floats merge where an expression compares them with each other, or is binned by them.
+/// Refuses those of the `columns` of an expression that have integers which floats merge.
 pub fn refuse_long_integers(
     frame: &DataFrame,
+    columns: &[&str],
     expression: &Expression,
     path: &Path,
 ) -> Result<(), FileError> {
-    let mut compared = expression.compared_columns();
-    match compared.find(|name| has_long_integers(frame, name)) {
+    match columns.iter().find(|name| has_long_integers(frame, name)) {
         None => Ok(()),
         Some(name) => Err(FileError::new(
             path,
@@ -1008,14 +1028,22 @@ mod tests {
             let values = operand_values(&table, &own.operands()[0], Path::new("t")).unwrap();
             let found = [0, 1, 2, 3].map(|at| own.value(&|_| values[at]));
             assert_eq!(found, expected, "{text}");
-            refuse_long_integers(&table, &own, Path::new("t")).unwrap();
+            refuse_long_integers(&table, &own.exact_columns(), &own, Path::new("t")).unwrap();
         }
-        for text in ["id == id + 1", "id"] {
+        for text in [
+            "id == id + 1",
+            "id - 37484563299062923 < 100",
+            "id < 37484563299062923.5",
+            "sqrt(id) > 1",
+        ] {
             let own = Expression::parse(text).unwrap();
-            refuse_long_integers(&table, &own, Path::new("t")).unwrap_err();
+            let found = refuse_long_integers(&table, &own.exact_columns(), &own, Path::new("t"));
+            assert!(found.is_err(), "{text}");
         }
+        let own = Expression::parse("id").unwrap();
+        refuse_long_integers(&table, &["id"], &own, Path::new("t")).unwrap_err();
         let own = Expression::parse("id > 6").unwrap();
-        refuse_long_integers(&table, &own, Path::new("t")).unwrap();
+        refuse_long_integers(&table, &own.exact_columns(), &own, Path::new("t")).unwrap();
         // Of floats, the last digits are lost.
         let floats = Column::new("id".into(), [large as f64]);
         let table = shearq_files::frames::frame(vec![floats]).unwrap();
@@ -1035,13 +1063,17 @@ mod tests {
             ("-(e2 - c2)", true),
             ("e2 - c2", false),
             ("e2^2", false),
-            ("1 - e2", false),
+            ("1 - e2", true),
+            ("c2 - e2", true),
+            ("-c2 + e2", false),
+            ("-0.001 + e2", false),
+            ("e2*cos(2*phi)", false),
+            ("-e2*sin(2*phi)", true),
+            ("-e2/P", true),
+            ("e2/P", false),
         ] {
-            assert_eq!(
-                Expression::parse(text).unwrap().is_negative(),
-                negative,
-                "{text}"
-            );
+            let own = Expression::parse(text).unwrap();
+            assert_eq!(own.falls_with("e2"), negative, "{text}");
         }
     }
 

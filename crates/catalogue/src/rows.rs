@@ -293,7 +293,10 @@ struct TableRows<'a> {
     signs: [[f64; 2]; 2],
     dw_signs: [f64; 2],
     c_signs: [f64; 2],
+    psf_signs: [f64; 2],
     sheared_of_rows: Option<Vec<usize>>,
+    // The sheared catalogue of the axes of e1 and e2, of each of the table.
+    of_axes: [usize; CATALOGUES],
     frame: &'a DataFrame,
     ids: Option<Vec<u64>>,
     // Rows without an identifier or unit, if they are left out.
@@ -351,15 +354,13 @@ impl<'a> TableRows<'a> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(file, places, &reading.truth)?;
         check_angles(source, reading, columns)?;
-        for expression in reading
-            .condition()
-            .into_iter()
-            .filter(|own| own.column().is_none())
-        {
-            refuse_long_integers(frame, expression, path)?;
+        if let Some(condition) = reading.condition() {
+            refuse_long_integers(frame, &condition.exact_columns(), condition, path)?;
         }
-        for expression in reading.binned() {
-            refuse_long_integers(frame, expression, path)?;
+        for binned in reading.binned() {
+            let mut exact = binned.exact_columns();
+            exact.extend(binned.column());
+            refuse_long_integers(frame, &exact, binned, path)?;
         }
         refuse_boolean_flags(frame, source, reading)?;
         let drops = reading.request.drop_missing;
@@ -406,10 +407,12 @@ impl<'a> TableRows<'a> {
                 .filter_map(|role| places.of((*role, 0)))
                 .collect(),
             signs: response_signs(source),
-            dw_signs: [Role::Dw1, Role::Dw2].map(|role| sign_of(source, role)),
-            c_signs: [Role::C1, Role::C2].map(|role| sign_of(source, role)),
+            dw_signs: WEIGHT_DERIVATIVE_ROLES.map(|role| source.sign_of(role)),
+            c_signs: [Role::C1, Role::C2].map(|role| source.sign_of(role)),
+            psf_signs: PSF_ROLES.map(|role| source.sign_of(role)),
             responses: responses(source),
             sheared_of_rows: sheared_of_rows.transpose()?,
+            of_axes: std::array::from_fn(|catalogue| source.of_axes(catalogue)),
             ids,
             unnamed,
             ids_are_units: source.unit.as_deref() == source.columns.of(Role::Id),
@@ -427,6 +430,10 @@ impl<'a> TableRows<'a> {
 
     fn pair(&self, columns: [usize; 2], at: usize) -> [f64; 2] {
         columns.map(|column| self.columns[column][at])
+    }
+
+    fn signed(&self, columns: [usize; 2], signs: [f64; 2], at: usize) -> [f64; 2] {
+        [0, 1].map(|k| signs[k] * self.value(columns[k], at))
     }
 
     fn of(&self, role: Role) -> Option<usize> {
@@ -594,15 +601,14 @@ impl<'a> TableRows<'a> {
     }
 
     fn sheared(&self, at: usize) -> usize {
-        self.source.of_axes(match &self.sheared_of_rows {
-            Some(sheared_of_rows) => sheared_of_rows[at],
-            None => self.source.sheared.unwrap_or(0),
-        })
+        let sheared_of_rows = self.sheared_of_rows.as_ref();
+        let sheared = sheared_of_rows.map_or(self.source.sheared, |all| Some(all[at]));
+        self.of_axes[sheared.unwrap_or(0)]
     }
 
     // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
     fn select(&self, at: usize) -> Selected {
-        let choice = |sheared: usize| self.choice(at, self.source.of_axes(sheared + 1));
+        let choice = |sheared: usize| self.choice(at, self.of_axes[sheared + 1]);
         let sheared = || Box::new(std::array::from_fn(choice));
         Selected {
             noshear: self.choice(at, 0),
@@ -760,7 +766,9 @@ impl<'a> TableRows<'a> {
             weight,
             response,
             g: [0.0; 2],
-            psf: self.psf.map_or([0.0; 2], |psf| self.pair(psf, at)),
+            psf: self
+                .psf
+                .map_or([0.0; 2], |psf| self.signed(psf, self.psf_signs, at)),
             psf_size: self
                 .psf_size
                 .map_or(1.0, |size| match self.source.psf_area {
@@ -839,9 +847,8 @@ impl<'a> TableRows<'a> {
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);
-        let dw = self.dw.map_or([0.0; 2], |dw| {
-            [0, 1].map(|k| self.dw_signs[k] * self.value(dw[k], at))
-        });
+        let dw = self.dw;
+        let dw = dw.map_or([0.0; 2], |dw| self.signed(dw, self.dw_signs, at));
         // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
         let weighted = |e: [f64; 2], response: [[f64; 2]; 2]| {
             [0, 1].map(|i| [0, 1].map(|j| weight * response[i][j] + e[i] * dw[j]))
@@ -874,9 +881,8 @@ impl<'a> TableRows<'a> {
                 *own = converted(self.pair(*columns, at))?;
             }
             let step = 2.0 * self.reading.request.step;
-            let [s1, s2] = self.source.signs;
-            let sign = |i: usize, j: usize| if i == j { 1.0 } else { s1 * s2 };
-            let of = |i: usize, j: usize| sign(i, j) * (all[2 * j][i] - all[2 * j + 1][i]) / step;
+            let of =
+                |i: usize, j: usize| self.signs[i][j] * (all[2 * j][i] - all[2 * j + 1][i]) / step;
             return Some((e, weighted(e, [0, 1].map(|i| [0, 1].map(|j| of(i, j))))));
         }
         let of = |i: usize, j: usize| self.signs[i][j] * self.response(&self.responses[i][j], at);
@@ -1013,23 +1019,15 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
 
 // The signs of responses in the axes of e1 and e2, of which a formula such as `-e2` turns one.
 fn response_signs(source: &Source) -> [[f64; 2]; 2] {
+    let has_sheared = sheared_columns(source)[0].is_some();
     [0, 1].map(|i| {
-        [0, 1].map(|j| match source.columns.of(RESPONSES[i][j]) {
-            _ if i == j => 1.0,
-            Some(name) if sheared_columns(source)[0].is_none() => source.sign(name, &[i, j]),
-            _ => {
-                let name = source.columns.of_sheared(sheared_pair(i, j)[0]);
-                name.map_or(1.0, |name| source.sign(name, &[i, j]))
-            }
+        [0, 1].map(|j| {
+            let role = RESPONSES[i][j];
+            let column = source.columns.of(role).filter(|_| !has_sheared);
+            let sheared = || source.columns.of_sheared(sheared_pair(i, j)[0]);
+            source.sign(role, column.or_else(sheared))
         })
     })
-}
-
-// The sign of a column of one component, in the axes of e1 and e2.
-fn sign_of(source: &Source, role: Role) -> f64 {
-    let axis = usize::from([Role::Dw2, Role::C2].contains(&role));
-    let name = source.columns.of(role);
-    name.map_or(1.0, |name| source.sign(name, &[axis]))
 }
 
 // Share of rows that may have the true shear of another row: two detections within a pixel are rare. Chosen by hand.
@@ -1103,7 +1101,8 @@ impl Found {
             *count += u64::from((part.value(*column, at) != 0.0) != good);
         }
         // A shared ellipticity is reported by itself.
-        let shared = self.repeats.add(part.columns, at);
+        let of_e = part.shape_columns(at) == part.e;
+        let shared = of_e && self.repeats.add(part.columns, at);
         let own = part.compared.iter().map(|column| part.value(*column, at));
         let own = own.fold(0, |key, value| identity::hash(key ^ value.to_bits()));
         self.content = self.content.wrapping_add(own);

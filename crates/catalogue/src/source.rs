@@ -15,9 +15,9 @@ use crate::expression::{
     Expression, Operand, operand_values, refuse_long_integers, texts_of, with_names,
 };
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
-use crate::recognition::{fits_any, has_any, recognition, words};
+use crate::recognition::{fits_any, has_any, names_of_role, recognition, words};
 
-use crate::columns::{Columns, Names, Preset, Shapes, base, may_be_number};
+use crate::columns::{Columns, Names, Preset, Shapes, base, has_operand, may_be_number};
 use crate::identity;
 use crate::request::{Input, Request, Units};
 use crate::roles::{CATALOGUES, Places, Role, name_of};
@@ -272,10 +272,7 @@ impl Source {
                 }
             };
             // A formula may contain the conversion.
-            let formula = self
-                .columns
-                .of(Role::E1)
-                .filter(|e1| self.formulas.iter().any(|own| own.text() == *e1));
+            let formula = self.columns.of(Role::E1).filter(|e1| self.is_formula(e1));
             let formula = formula.map_or(String::new(), |e1| {
                 format!(" Try: --ellipticity shear if `{e1}` is a shear already.")
             });
@@ -335,12 +332,19 @@ impl Source {
         self.formulas.iter().any(|own| own.text() == name)
     }
 
-    /// The sign with which a column that has those of the axes `axes` is read: a formula has the right one.
-    pub fn sign(&self, column: &str, axes: &[usize]) -> f64 {
-        match self.is_formula(column) {
-            true => 1.0,
-            false => axes.iter().map(|axis| self.signs[*axis]).product(),
+    /// The sign with which a column of a role is read, in the axes of e1 and e2: a formula has the right one.
+    pub fn sign(&self, role: Role, column: Option<&str>) -> f64 {
+        match column {
+            Some(column) if !self.is_formula(column) => {
+                axes(role).iter().map(|axis| self.signs[*axis]).product()
+            }
+            _ => 1.0,
         }
+    }
+
+    /// The sign of the column of a role.
+    pub fn sign_of(&self, role: Role) -> f64 {
+        self.sign(role, self.columns.of(role))
     }
 
     /// The sheared catalogue (from 1; 0 for noshear) of the axes of e1 and e2 that the table calls `catalogue`.
@@ -359,19 +363,11 @@ impl Source {
             return None;
         }
         let formula = self.columns.of(e)?;
-        let axes = [
-            (Role::R12, vec![0, 1]),
-            (Role::R21, vec![0, 1]),
-            (Role::Dw1, vec![0]),
-            (Role::Dw2, vec![1]),
-            (Role::C1, vec![0]),
-            (Role::C2, vec![1]),
-        ];
-        let roles = axes.iter().filter_map(|(role, axes)| {
+        let names = ROLES_WITH_AXES.iter().filter_map(|role| {
             let name = self.columns.of(*role)?;
-            (self.sign(name, axes) < 0.0).then(|| format!("`{name}`"))
+            (self.sign_of(*role) < 0.0).then(|| format!("`{name}`"))
         });
-        let mut changed: Vec<String> = roles.collect();
+        let mut changed: Vec<String> = names.collect();
         if a * b < 0.0 && (self.has_sheared_rows() || self.has_sheared_columns() || self.selects) {
             changed.push(format!("the artificial shear of {0}p and {0}m", k + 1));
         }
@@ -793,7 +789,10 @@ pub fn needed_columns(
     let larger = around_patches(names).map(String::as_str);
     let larger = larger.filter(|_| own.columns.of(Role::Unit).is_some_and(is_patch));
     let convergence = convergence(names).map(String::as_str);
+    // Of several methods, the texts of a step decide.
+    let others = own.columns.others().map(String::as_str);
     let more = operands.chain(roles).chain(larger).chain(convergence);
+    let more = more.chain(others);
     let more = more.map(str::to_owned);
     let all: BTreeSet<String> = read.chain(more).collect();
     Ok(all
@@ -972,6 +971,9 @@ fn convergence(names: &[String]) -> Option<&String> {
     names.iter().find(|name| has_any(known, name))
 }
 
+// m from which a convergence matters: a twentieth of what surveys require.
+const MIN_CONVERGENCE: f64 = 1e-4;
+
 // Galaxies have the reduced shear γ/(1 − κ) (Bartelmann & Schneider 2001, Phys. Rep. 340, 291, equation 4.13): simulations that state
 // κ beside `gamma1` or `shear1` state γ, and `g1` is reduced. A κ of 0.08 gave m = 0.097 for 0.008 without a word.
 fn unreduced(
@@ -980,29 +982,28 @@ fn unreduced(
     names: &[String],
     columns: &Columns,
 ) -> Result<Option<String>, FileError> {
-    let (Some(g1), Some(g2), Some(kappa)) = (
-        columns.of(Role::G1),
-        columns.of(Role::G2),
-        convergence(names),
-    ) else {
+    let [g1, g2] = [Role::G1, Role::G2].map(|role| columns.of(role));
+    let (Some(g1), Some(g2), Some(kappa)) = (g1, g2, convergence(names)) else {
         return Ok(None);
     };
     let words = words(g1);
     let is_shear = words.contains("gamma") || words.contains("shear");
     // Also in a formula.
-    if !is_shear || words.contains("reduced") || g1.contains(kappa.as_str()) {
+    if !is_shear || words.contains("reduced") || has_operand(g1, |own| own == kappa) {
         return Ok(None);
     }
-    let mut is_zero = true;
+    let mut is_small = true;
     let mut add = |part: &DataFrame| -> Result<(), FileError> {
-        is_zero &= (table::numbers(part, kappa, &place.path)?.iter()).all(|kappa| *kappa == 0.0);
+        // Marks of a missing κ are above 1.
+        let matters = |own: &f64| (MIN_CONVERGENCE..1.0).contains(&own.abs());
+        is_small = is_small
+            && !table::numbers(part, kappa, &place.path)?
+                .iter()
+                .any(matters);
         Ok(())
     };
-    match frame {
-        Some(frame) => add(frame)?,
-        None => table::read_parts(place, &[kappa], &[], |part| add(&part))?,
-    }
-    Ok((!is_zero).then(|| {
+    each_part(place, frame, &[kappa], &[], &mut add)?;
+    Ok((!is_small).then(|| {
         let part = |g: &str| match Expression::parse(g).is_ok_and(|own| own.column().is_some()) {
             true => g.to_owned(),
             false => format!("({g})"),
@@ -1036,16 +1037,61 @@ fn add_sheared(
     (names, Vec::new())
 }
 
-// The signs of e1 and e2 in the axes of the table.
+// Roles whose columns have signs of the axes of the table.
+const ROLES_WITH_AXES: [Role; 8] = [
+    Role::R12,
+    Role::R21,
+    Role::Dw1,
+    Role::Dw2,
+    Role::C1,
+    Role::C2,
+    Role::Psf1,
+    Role::Psf2,
+];
+
+// The axes that change the sign of a column of a role: 0 of e1, 1 of e2.
+fn axes(role: Role) -> &'static [usize] {
+    match role {
+        Role::R12 | Role::R21 => &[0, 1],
+        Role::Dw1 | Role::C1 | Role::Psf1 => &[0],
+        Role::Dw2 | Role::C2 | Role::Psf2 => &[1],
+        _ => &[],
+    }
+}
+
+// The signs of e1 and e2 in the axes of the table: those of a column of ellipticities in a formula, or of its first column.
 fn signs(formulas: &[Expression], columns: &Columns) -> [f64; 2] {
     [Role::E1, Role::E2].map(|role| {
         let mut formulas = formulas.iter();
         let own = formulas.find(|own| Some(own.text()) == columns.of(role));
-        match own.is_some_and(Expression::is_negative) {
-            true => -1.0,
-            false => 1.0,
-        }
+        let falls = own.is_some_and(|own| {
+            let is_known =
+                |name: &&str| names_of_role(role).any(|known| known.eq_ignore_ascii_case(name));
+            let column = own
+                .columns()
+                .find(is_known)
+                .or_else(|| own.columns().next());
+            column.is_some_and(|column| own.falls_with(column))
+        });
+        if falls { -1.0 } else { 1.0 }
     })
+}
+
+/// Gives `take` the table in memory, or the parts of the file.
+///
+/// # Errors
+/// Those of [`table::read_parts`] and of `take`.
+pub fn each_part(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    wanted: &[&str],
+    texts: &[&str],
+    take: &mut dyn FnMut(&DataFrame) -> Result<(), FileError>,
+) -> Result<(), FileError> {
+    match frame {
+        Some(frame) => take(frame),
+        None => table::read_parts(place, wanted, texts, |part| take(&part)),
+    }
 }
 
 // The formulas of weights and flags of which each sheared catalogue has columns, with those of its columns. Flags of failed
@@ -1216,10 +1262,7 @@ fn names_sheared(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result
         }
         Ok(())
     };
-    match frame {
-        Some(frame) => add(frame)?,
-        None => table::read_parts(place, &[name], &[name], |part| add(&part))?,
-    }
+    each_part(place, frame, &[name], &[name], &mut add)?;
     let [noshear, plus1, minus1, plus2, minus2] = seen;
     let sheared = plus1 || minus1 || plus2 || minus2;
     let pair = plus1 && minus1 || plus2 && minus2;
@@ -1279,10 +1322,7 @@ fn counted(
         }
         Ok(())
     };
-    match frame {
-        Some(frame) => add(frame)?,
-        None => table::read_parts(place, &[name], &[name], |part| add(&part))?,
-    }
+    each_part(place, frame, &[name], &[name], &mut add)?;
     Ok((keys.len(), rows))
 }
 
@@ -1308,9 +1348,7 @@ pub fn add_formulas(
     path: &Path,
 ) -> Result<DataFrame, FileError> {
     for formula in formulas {
-        if formula.column().is_none() {
-            refuse_long_integers(&part, formula, path)?;
-        }
+        refuse_long_integers(&part, &formula.exact_columns(), formula, path)?;
         let operands = formula.operands().iter();
         let operands = operands.map(|own| operand_values(&part, own, path));
         let operands: Vec<_> = operands.collect::<Result<_, _>>()?;

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use shearq_catalogue::expression::{Expression, has_long_integers, integers_of, texts_of};
 use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request};
 use shearq_catalogue::rows::rows;
-use shearq_catalogue::source::{Reading, Source, sources};
+use shearq_catalogue::source::{Reading, Source, each_part, sources};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
@@ -318,33 +318,29 @@ pub(super) fn with_numbers(
         };
         let (mut texts, mut integers) = (BTreeSet::new(), BTreeSet::new());
         let mut is_long = false;
-        let mut add = |frame: &DataFrame| match (texts_of(frame, name), integers_of(frame, name)) {
-            (Some(values), _) if texts.len() <= MAX_BINS => {
-                texts.extend(values.flatten().map(str::to_owned));
+        let mut add = |frame: &DataFrame| {
+            match (texts_of(frame, name), integers_of(frame, name)) {
+                (Some(values), _) if texts.len() <= MAX_BINS => {
+                    texts.extend(values.flatten().map(str::to_owned));
+                }
+                (None, Some(values)) if integers.len() <= MAX_BINS => {
+                    is_long |= has_long_integers(frame, name);
+                    integers.extend(values.flatten());
+                }
+                _ => {}
             }
-            (None, Some(values)) if integers.len() <= MAX_BINS => {
-                is_long |= has_long_integers(frame, name);
-                integers.extend(values.flatten());
-            }
-            _ => {}
+            Ok(())
         };
         // Numbers of a text table are read as texts, too.
         let mut has_texts = false;
         for input in &request.catalogues {
             for source in sources(input, &reading)? {
-                match &source.frame {
-                    Some(frame) => {
-                        has_texts |= texts_of(frame, name).is_some();
-                        add(frame);
-                    }
-                    None => {
-                        table::read_parts(&source.place, &[name], &[name], |frame| {
-                            add(&frame);
-                            Ok(())
-                        })?;
-                        has_texts |= has_texts_in(&source.place, name)?;
-                    }
-                }
+                let frame = source.frame.as_ref();
+                each_part(&source.place, frame, &[name], &[name], &mut add)?;
+                has_texts |= match frame {
+                    Some(frame) => texts_of(frame, name).is_some(),
+                    None => has_texts_in(&source.place, name)?,
+                };
             }
         }
         let are_numbers = texts.iter().all(|text| text.trim().parse::<f64>().is_ok());
