@@ -421,6 +421,7 @@ def test_columns_that_are_not_needed_are_not_read():
 
     class Dataset:
         ndim = 1
+        shape = (100,)
         dtype = np.dtype("f8")
 
         def __init__(self, name):

@@ -46,6 +46,13 @@ def test_separations_without_pairs_are_missing():
     assert not np.isfinite(modes["map2"][5:]).any()
 
 
+def test_few_galaxies_are_refused():
+    pytest.importorskip("treecorr")
+    few = {name: column[:3] for name, column in _field(np.random.default_rng(5)).items()}
+    with pytest.raises(ValueError, match="shears: found 3 galaxies with a shear; expected 5 or more"):
+        shearq.null_tests(few, against=("x",))
+
+
 def test_tables_are_read_from_files(tmp_path):
     pytest.importorskip("treecorr")
     table = pytest.importorskip("astropy.table")

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_THREADS = 1024
+# Longest vector whose numbers are columns; longer ones are stamps.
+MAX_VECTOR = 8
 
 
 def shown(shape: tuple[int, ...]) -> str:

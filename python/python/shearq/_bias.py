@@ -217,7 +217,7 @@ def bias(
         mean distortion by 2(1 − ⟨e_rms²⟩), with e_rms in ``rms_e``, or else e_rms² = ⟨χ²⟩/2 − ⟨σ²⟩ with σ in ``sigma_e``.
     truth_sign : {'standard', 'challenge'}, optional
         Sign of the true g2. By default, for a table with a shear per galaxy: as the file states, else (for x, y, g1, g2)
-        the sign in which the shear is an E-mode field, else the sign that e2 follows by 5σ; required if these are unclear.
+        the sign in which the shear is an E-mode field, else the sign with which e2 correlates at 5σ; required if these are unclear.
         Other shears are standard.
     bins : str, (str, int or sequence of float), or a list of up to three
         Also estimate in bins of a column or expression: ``("snr", 5)`` has five bins with equally many galaxies,

@@ -34,7 +34,7 @@ def detect(
     image : array of shape (ny, nx)
         The exposure, without sky. Pixels that are masked, not finite or −1e30 are missing: nothing is detected near them.
     psf : array of shape (py, px)
-        The PSF of the exposure as a stamp, whose centre is that of the star.
+        The PSF of the exposure as a stamp that is centred on the star.
     noise : float
         Standard deviation of the noise of a pixel, which has to be white and of one level.
     mask : array of shape (ny, nx), optional

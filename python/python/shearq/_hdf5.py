@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from ._arrays import MAX_VECTOR, shown
+
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-# Most numbers of a row that are read: more than those of vectors that become columns.
-_MAX_NUMBERS = 64
 # The column by which metadetect itself names the step of a row.
 _STEP = "mdet_step"
 # Names of the groups of metadetect's artificial shears, and what metadetect calls them.
@@ -55,7 +56,7 @@ class Hdf5Table(Mapping[str, Any]):
         tables = list(self._steps.values()) if self._steps else [group]
         columns = [_datasets(table, any_shape=True) for table in tables]
         # The names of the groups state the steps, also where each group repeats its own in a column.
-        shared = [key for key in columns[0] if all(key in other and other[key].ndim > 0 for other in columns) and not (self._steps and key == _STEP)]
+        shared = [key for key in columns[0] if all(key in other and _is_column(other[key]) for other in columns) and not (self._steps and key == _STEP)]
         #: What there is of other datasets: `flags` of the unsheared group alone were dropped without a word.
         self.partial = {key: self._part(key, columns) for own in columns for key in own if key not in shared and key != _STEP}
         self._columns = {key: [column[key] for column in columns] for key in shared}
@@ -70,16 +71,15 @@ class Hdf5Table(Mapping[str, Any]):
 
     def _part(self, key: str, columns: Sequence[Mapping[str, Any]]) -> str:
         absent = [step for step, own in zip(self._steps, columns) if key not in own]
-        return f"is not in the group{'s' * (len(absent) > 1)} of {', '.join(absent)}" if absent else "is a single value"
+        if absent:
+            return f"is not in the group{'s' * (len(absent) > 1)} of {', '.join(absent)}"
+        shape = next(own[key].shape for own in columns if not _is_column(own[key]))
+        return f"has the shape {shown(shape)}" if shape else "is a single value"
 
     def __getitem__(self, key: str) -> Any:
         if self._steps and key == _STEP:
             return np.repeat(np.array(list(self._steps)), self._rows)
-        parts = self._columns[key]
-        if parts[0].ndim > 1 and np.prod(parts[0].shape[1:]) > _MAX_NUMBERS:
-            # Of stamps, the shape alone, which takes no memory.
-            return np.broadcast_to(np.zeros((), parts[0].dtype), (sum(self._rows), *parts[0].shape[1:]))
-        return np.concatenate([_native(part[:]) for part in parts])
+        return np.concatenate([_native(part[:]) for part in self._columns[key]])
 
     def numbers(self) -> list[str]:
         """The columns of numbers."""
@@ -112,6 +112,11 @@ class _Field:
 
     def __getitem__(self, rows: slice) -> Any:
         return self._rows.fields(self._name)[rows]
+
+
+def _is_column(dataset: Any) -> bool:
+    """Whether a dataset has a few numbers or a text in each row."""
+    return bool(dataset.ndim > 0 and math.prod(dataset.shape[1:]) <= MAX_VECTOR)
 
 
 def _has_fields(value: Any) -> bool:

@@ -15,7 +15,7 @@ from ._tables import file_format
 _DEGREES = {"ra_units": "deg", "dec_units": "deg"}
 _PSF = ("psf_e1", "psf_e2")
 # In least separations: of a constant ξ₊, for which T₊(0) = 12/5, the missing separations are 0.6/5² = 2 %.
-_MIN_APERTURE = 5
+_MIN_APERTURE_PER_SEPARATION = 5
 
 
 def null_tests(
@@ -50,8 +50,8 @@ def null_tests(
         Arrays by name of each test:
         ``'modes'``: ``r``, ``xip``, ``xim`` and their ``error``, and ⟨M_ap²⟩ of E and B modes (``map2``, ``mx2``,
         ``map2_error``) for apertures r (Schneider et al. 2002, A&A 396, 1). ⟨M_ap²⟩ is NaN for apertures below five times
-        the least separation, and above half the largest of the galaxies: ξ at the separations that lack would be E modes
-        that appear as B modes.
+        the least separation, and above half the largest of the galaxies: without ξ at the
+        missing separations, E modes appear as B modes.
         ``'points'``: ``r``, ``gt``, ``gx``, ``error``.
         Separations without pairs are NaN.
         ``'rho'``: ``r`` and ``rho1`` to ``rho5`` (Rowe 2010, MNRAS 404, 350; Jarvis et al. 2016, MNRAS 460, 2245), each
@@ -78,6 +78,8 @@ def null_tests(
     weight = _columns("shears", shears, ("w",))["w"] if "w" in names else np.ones(len(galaxies["ra"]))
     good = (weight > 0) & np.isfinite(galaxies["g1"]) & np.isfinite(galaxies["g2"])
     galaxies, weight = {name: column[good] for name, column in galaxies.items()}, weight[good]
+    if len(weight) < (least := max(2, bins)):
+        raise ValueError(f"shears: found {len(weight)} galaxies with a shear; expected {least} or more")
 
     def catalogue(table: Mapping[str, Any], **values: Any) -> Any:
         return treecorr.Catalog(ra=table["ra"], dec=table["dec"], **_DEGREES, **values)
@@ -89,7 +91,7 @@ def null_tests(
     has_pairs = modes.npairs > 0
     # Only with ξ from (nearly) zero to twice the aperture.
     largest = modes.right_edges[has_pairs].max(initial=0)
-    is_complete = (modes.rnom >= _MIN_APERTURE * modes.left_edges[0]) & (2 * modes.rnom <= largest)
+    is_complete = (modes.rnom >= _MIN_APERTURE_PER_SEPARATION * modes.left_edges[0]) & (2 * modes.rnom <= largest)
     found: dict[str, dict[str, Any]] = {
         "modes": _where(has_pairs, r=modes.meanr, xip=modes.xip, xim=modes.xim, error=np.sqrt(modes.varxip))
         | _where(is_complete, map2=map2, mx2=mx2, map2_error=np.sqrt(variance))

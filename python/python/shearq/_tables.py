@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _hdf5, _schema, _shearq
+from ._arrays import MAX_VECTOR
 
 if TYPE_CHECKING:
     import astropy.table
@@ -58,10 +59,6 @@ def to_polars(catalogue: Any) -> polars.DataFrame:
     import polars
 
     return polars.DataFrame(_columns(catalogue))
-
-
-# Longest vector whose numbers are columns; longer ones are stamps.
-_MAX_VECTOR = 8
 
 
 def named_columns(table: Any) -> list[tuple[str, Any]]:
@@ -224,7 +221,7 @@ def _components(name: str, array: Any) -> list[tuple[str, Any]]:
             rows = [np.full(len(first), np.nan) if is_missing(value) else np.asarray(value) for value in array]
             if all(row.shape == rows[0].shape for row in rows):
                 array = np.stack(rows)
-    if array.ndim > 1 and 1 <= (numbers := math.prod(array.shape[1:])) <= _MAX_VECTOR:
+    if array.ndim > 1 and 1 <= (numbers := math.prod(array.shape[1:])) <= MAX_VECTOR:
         # A matrix row by row, as in FITS files.
         flat = array.reshape(len(array), numbers)
         return [(f"{name}[{k}]" if numbers > 1 else name, flat[:, k]) for k in range(numbers)]
