@@ -611,7 +611,7 @@ macro_rules! choices {
 choices! {
     Kind {
         Great10: "great10", "GREAT10 Galaxy Challenge";
-        Great3: "great3", "Sets with one shear each, ranked by Q_c (with --data)";
+        Great3: "great3", "Sets with one shear each, ranked by Q_c";
     }
     FileFormat {
         Parquet: "parquet", "Parquet";

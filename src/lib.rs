@@ -94,10 +94,10 @@ struct Cli {
 // What is said on standard error.
 #[derive(Debug, clap::Args)]
 struct Talk {
-    /// Say warnings and errors only: no notes and no progress.
+    /// Print warnings and errors only: no notes and no progress.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
-    /// Say version and command at the start, and time and memory at the end.
+    /// Print version and command at the start, and time and memory at the end.
     #[arg(short, long, global = true)]
     verbose: bool,
 }

@@ -76,7 +76,7 @@ struct RecordArguments {
     /// from the folder in which it is started.
     #[arg(last = true, value_name = "COMMAND", conflicts_with_all = ["submission", "sets", "images"])]
     command: Vec<String>,
-    /// Largest accepted shift of catalogues: `sigma=3` standard errors of the paired difference, or `m=5e-4`, `c=5e-5`,
+    /// Largest accepted change of the metrics of catalogues: `sigma=3` standard errors of the paired difference, or `m=5e-4`, `c=5e-5`,
     /// `alpha=1e-3` or `relative=0.01` of other metrics, whichever is larger. May be given several times.
     #[arg(long, value_name = "NAME=NUMBER", requires = "command")]
     tolerance: Vec<String>,

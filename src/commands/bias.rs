@@ -55,8 +55,8 @@ pub(crate) struct Arguments {
     /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
     #[arg(long, value_name = "ERROR", value_parser = planned_error, allow_hyphen_values = true, exclusive = true)]
     plan: Option<f64>,
-    /// Write example catalogues `plus.csv` and `minus.csv` into this folder: 20,000 galaxies of which m1 is 0.01, m2 -0.02,
-    /// c1 0.001 and c2 -0.0005.
+    /// Write example catalogues `plus.csv` and `minus.csv` into this folder: 20,000 galaxies with m1 = 0.01, m2 = -0.02,
+    /// c1 = 0.001 and c2 = -0.0005.
     #[arg(long, value_name = "DIR", exclusive = true)]
     example: Option<PathBuf>,
     /// Plot m and c to this file, PDF, PNG or SVG by its ending.
@@ -107,7 +107,7 @@ struct Summing {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
-    /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
+    /// an E-mode field; else the sign with which e2 correlates at 5σ; required if these are unclear. Shears of options, of columns of
     /// the catalogues and of tables with the column catalogue: standard].
     #[arg(long, value_parser = named::<TruthSign>())]
     truth_sign: Option<TruthSign>,
@@ -124,7 +124,7 @@ struct Summing {
     #[arg(long, value_name = "COLUMN", requires = "like", conflicts_with_all = ["against", "sums", "shard"])]
     tomography: Option<String>,
     /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
-    /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
+    /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear is included (see
     /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
     // The command that keeps a selection is called select; clap would suggest --seed.
     #[arg(

@@ -113,7 +113,7 @@ struct NewArguments {
     /// Entry by entry, a team can tune a spectrum to the truth without images.
     #[arg(long)]
     spectra: bool,
-    /// Most entries of a team, because published values reveal the truth entry by entry [default: 10].
+    /// Largest number of entries of a team, because published values reveal the truth entry by entry [default: 10].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     entries_per_team: Option<u32>,
     /// First day of entries in UTC, or a moment with its zone, such as 2026-12-01T18:00[Europe/Berlin].
@@ -141,7 +141,7 @@ struct NewArguments {
 /// Check an entry, without the true shear.
 ///
 /// ENTRY is an archive (.tar.gz, .zip) or a folder of catalogues or power spectra. Grid, sets and conventions come from
-/// challenge.toml. If the images are there, they are measured for comparison, in the time of `48/linear/star`. This finds
+/// challenge.toml. If the images are there, they are measured for comparison, which takes as long as `48/linear/star`. This finds
 /// swapped or flipped components, exchanged rows, images without measured shapes, and distortions that are given as
 /// shear. Images that differ from SHA256SUMS and symbolic links are refused.
 ///
@@ -199,7 +199,7 @@ struct RankArguments {
     /// Write the leaderboard to this HTML file, and as CSV and JSON with the same name.
     #[arg(long, value_name = "FILE", value_parser = page)]
     report: Option<PathBuf>,
-    /// Make table, page and messages for you alone: with all metrics, those of single sets, and what the comparison with
+    /// Write a table, a page and messages for you alone, with all metrics, those of single sets, and what the comparison with
     /// the true shear showed. Only you can read the files.
     #[arg(long)]
     detail: bool,

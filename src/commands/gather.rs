@@ -57,7 +57,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
-    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV, SIN, STG). Catalogues have its identities and places.
+    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV, SIN, STG). Catalogues have its identifiers and positions.
     /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file. One table for all exposures, or one for each.
     /// With --stamps, a row per stamp in their order: its columns id, x, y, ra and dec are copied as they are.
     #[arg(long, value_name = "FILE", num_args = 1..)]
@@ -65,7 +65,7 @@ pub(crate) struct Arguments {
     /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
     #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
     table: Option<String>,
-    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
+    /// Column of identifiers, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
     #[arg(long, value_name = "NAME", requires = "positions")]
     id: Option<String>,
     /// Further columns of the positions for the catalogue, such as mag,z.
@@ -95,7 +95,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=32))]
     psf_oversampling: Option<u8>,
     /// Maps of the variance of each pixel: of the stamps in the same order, or of the exposure. The noise of a galaxy is the median
-    /// of its stamp beyond a quarter of the side from the centre, where a map has none of the galaxy's own noise.
+    /// of its stamp beyond a quarter of the side from the centre, where a map does not contain the Poisson noise of the galaxy.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["noise", "weight_map"])]
     variance: Vec<PathBuf>,
     /// Use only variance maps of this name [default files: the stamps or the exposure].
@@ -111,8 +111,8 @@ pub(crate) struct Arguments {
     /// mirrors or shears the pixels, else pixel].
     #[arg(long, value_name = "pixel|sky")]
     frame: Option<Frame>,
-    /// Electrons per unit of the image: linear configurations then count the Poisson noise of each galaxy, by its measured flux and
-    /// size, as noise.
+    /// Electrons per unit of the image: linear configurations then add the Poisson noise of each galaxy, by its measured flux and
+    /// size.
     #[arg(long, value_name = "E_PER_ADU")]
     gain: Option<f64>,
     /// Standard deviation of the noise per pixel, written to the header for configurations that do not measure it.

@@ -24,11 +24,11 @@ use shearq_results::views::mean::mean_table;
 /// Mean shear of each set, for fields of constant shear, or of catalogues of any program.
 ///
 /// With --measured, the mean shear is the mean ellipticity of all galaxies without a flag, divided by their mean response if
-/// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
+/// the configuration has a response. The error includes the error of the mean response, and the noise of one star per image. It
 /// assumes independent galaxies, apart from branches of GREAT3 with constant shear: their galaxies are pairs that are rotated by
 /// 90 degrees, so that the error is that of the noise of pixels alone.
 ///
-/// With CATALOGUE, the tables and the options of their columns are those of `bias`, and their rows are one mean: g = ⟨R⟩⁻¹⟨e⟩, with
+/// With CATALOGUE, the tables and the options of their columns are those of `bias`, and all rows make one mean: g = ⟨R⟩⁻¹⟨e⟩, with
 /// responses of columns or of the sheared catalogues of metacal and metadetect. Errors are from a jackknife over units.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px), and

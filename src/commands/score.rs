@@ -69,7 +69,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "V", allow_hyphen_values = true)]
     noise_var: Option<f64>,
     /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
-    /// the sign in which the shear is an E-mode field, else the sign that e2 follows; required if these are unclear].
+    /// the sign in which the shear is an E-mode field, else the sign with which e2 correlates at 5σ; required if these are unclear].
     #[arg(long, value_parser = named::<TruthSign>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
     truth_sign: Option<TruthSign>,
     /// Pixels per side of a stamp, for --truth [default: 48].

@@ -24,7 +24,7 @@ use shearq_simulate::set::SimulationSettings;
 /// 3.4 px. The others differ by S/N 10 (4 to 6), S/N 40 (7 to 9), many S/N (10 to 12); small (13, 14), large (15, 16)
 /// and many sizes (17, 18); a Kolmogorov PSF (19, 20); many bulge fractions (21, 22); displaced bulges (23, 24).
 ///
-/// S/N is √(Σ I²)/σ before lensing and behind a round PSF. Images that the same settings made are kept, so the same
+/// S/N is √(Σ I²)/σ of the galaxy before lensing, convolved with a round PSF. Images that the same settings made are kept, so the same
 /// command resumes a stopped simulation.
 ///
 /// With --constant-shear all galaxies have one shear. Several shears, --opposite or --rotated make a folder for each
@@ -58,7 +58,7 @@ pub(crate) struct Arguments {
     /// Also simulate the galaxies under the opposite shear, those of a branch into OUT/opposite.
     #[arg(long, requires = "sheared", conflicts_with_all = ["amplitude", "tilt"])]
     opposite: bool,
-    /// Also simulate the galaxies rotated by 90 degrees; scenes with the places of their galaxies.
+    /// Also simulate the galaxies rotated by 90 degrees, in scenes also their positions.
     #[arg(long, requires = "turnable", conflicts_with_all = ["amplitude", "tilt"])]
     rotated: bool,
     /// Simulate a branch of this challenge: great3.
@@ -110,7 +110,7 @@ struct SceneArguments {
     /// Least and largest S/N of galaxies, each alone [default: 3,400]. The noise of a pixel is 1.
     #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, value_parser = two_numbers)]
     snr: Option<[f64; 2]>,
-    /// Slope d log₁₀ N/dm of the number counts between them.
+    /// Slope of the number counts per magnitude, d log₁₀ N/d mag, between these S/N.
     #[arg(long, value_name = "SLOPE", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().counts_slope)]
     counts_slope: f64,
     /// Stars per arcmin², of S/N 50 to 2000.

@@ -65,7 +65,7 @@ pub struct Tile {
 }
 
 impl Detector {
-    /// Detections behind `star`, a stamp whose centre is that of the star, in noise. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
+    /// Detections behind `star`, a stamp centred on the star, in noise. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
     ///
     /// # Errors
     /// If the star has no light or is larger than a stamp, or the noise level is not a positive number.
