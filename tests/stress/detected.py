@@ -2,14 +2,15 @@
 
     python tests/stress/detected.py --shearq target/release/shearq --work FOLDER --variant default --scenes 150 --seed 9001
 
-The mean response of catalogues under ±g contains terms of the order g², so that m of two shears has 0.4 |g|² that no weak shear has.
-By Simpson's rule the integral of the response from -g to g is 2g (R(-g) + 4 R(0) + R(g)) / 6, up to the order g⁴: m by this
-response,
+The mean response of catalogues under ±g contains terms of the order g², so that m of two shears has terms in |g|² that no weak shear
+has. The response is that to a shear which is added to g by (g + δ)/(1 + g* δ): along g, δ changes it by 1 - |g|². The integral of
+R/(1 - |g|²) from -g to g is, by Simpson's rule and up to the order g⁴, 2g (k R(-g) + 4 R(0) + k R(g)) / 6 with k = 1/(1 - |g|²), and
 
-    m = (e(+g) - e(-g)) / (integral of R) - 1,
+    m = (e(+g) - e(-g)) / (integral of R/(1 - |g|²)) - 1
 
 is zero for each estimator whose response is the derivative of its mean, for strong shears, too. Shears of 0.08 give errors of m four
-times as small as those of 0.02. The script prints m by this response and by that of ±g alone.
+times as small as those of 0.02. The script prints m by this response and by that of ±g alone, which is larger by |g|²/3 for a
+constant response.
 
 Each piece of scenes is simulated, measured and deleted. Sums of a scene are added to FOLDER/VARIANT.jsonl, so that a stopped run
 continues; `--report` prints the results of all variants in FOLDER.
@@ -93,7 +94,7 @@ def run(options, *arguments):
 
 
 def biases(units):
-    """m1, m2 and their mean (10⁻³) by Simpson's rule and by ±g alone, and c1, c2 (10⁻⁴), with errors of the jackknife over scenes."""
+    """m1, m2 and their mean (10⁻³) by Simpson's rule, and by ±g alone, and c1, c2 (10⁻⁴), with errors of the jackknife over scenes."""
     units = np.array(units)
 
     def estimate(total):
@@ -102,7 +103,8 @@ def biases(units):
         (minus, _, plus), (r_minus, r_none, r_plus) = mean
         both = (r_minus + r_plus) / 2
         result = []
-        for r in ((r_minus + 4 * r_none + r_plus) / 6, both):
+        added = 1 / (1 - 2 * SHEAR**2)
+        for r in ((added * r_minus + 4 * r_none + added * r_plus) / 6, both):
             m = np.linalg.solve(r, (plus - minus) / (2 * SHEAR)) - 1
             result += [*(1e3 * m), 1e3 * m.mean()]
         return np.array(result + [*(1e4 * np.linalg.solve(both, (plus + minus) / 2))])
