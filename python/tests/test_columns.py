@@ -40,11 +40,11 @@ def test_columns_of_any_shape_are_read_or_refused():
     matrix = np.tile(0.9 * np.eye(2), (N, 1, 1))
     for more, columns in [
         ({"w": WEIGHT[:, None], "flag": BAD[:, None] * 1, "R11": 0.9, "R22": 0.9}, {}),
-        ({"w": [[one] for one in WEIGHT], "flag": BAD, "R": matrix}, {"R11": "R[0]", "R22": "R[3]"}),
+        ({"w": [[one] for one in WEIGHT], "flag": BAD, "R": matrix}, {}),
     ]:
         assert m(shearq.bias(tables(**more), columns=columns, **SHEARS)) == pytest.approx(m(expected), abs=1e-12)
     # What has no role is listed.
-    found = shearq.bias(tables(stamps=np.zeros((N, 8, 8)), R=matrix), **SHEARS)
+    found = shearq.bias(tables(stamps=np.zeros((N, 8, 8)), R=matrix[:, 0]), **SHEARS)
     notes = " ".join(found.notes)
     assert "not known: stamps" in notes and "Not used: R[0]" in notes
     for more, message in [

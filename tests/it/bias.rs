@@ -1005,17 +1005,22 @@ fn shears_beside_a_convergence_are_no_reduced_ones() {
 fn limits_are_tested_in_each_bin() {
     let folder = Folder::new();
     let files = pair(&folder, "own", 0.02, |g, normal| {
-        let mut text = String::from("id,e1,e2,kind,also kind,g1,g2\n");
+        let mut text = String::from("id,e1,e2,kind,also kind,tile,g1,g2\n");
         for id in 0..300 {
             let [a, b] = normal.pair(0.3);
             // Quotation marks and `*` are characters like any others.
             let kinds = [("disc", 0.0), ("bulge", 0.05), ("star's", 0.0), ("d*", 0.0)];
             let (kind, m) = kinds[id % 4];
             let e = [a, b].map(|shape| shape + (1.0 + m) * g);
-            writeln!(text, "{id},{},{},{kind},{kind},{g},{g}", e[0], e[1]).unwrap();
+            let tile = 374_845_632_990_629_248_i64 + id as i64 % 2;
+            writeln!(text, "{id},{},{},{kind},{kind},{tile},{g},{g}", e[0], e[1]).unwrap();
         }
         text
     });
+    // Floats merge the two.
+    let tiles = rows(&folder, &format!("{files} --bins tile"));
+    let counts: Vec<f64> = tiles.iter().map(|row| number(row, "n")).collect();
+    assert_eq!(counts, [600.0, 300.0, 300.0]);
     let line = format!("bias {files} --bins kind --fail-above m=0.02");
     let output = shell(folder.root(), &format!("shearq {line}"));
     let [printed, told] =

@@ -760,8 +760,9 @@ fn unsheared_column<'f>(
 }
 
 // Ends of the names of a method: those of its ellipticities, responses and weights.
-const ENDS_OF_METHODS: [&str; 11] = [
-    "_g_K", "_gK", "_g[K]", "_e_K", "_eK", "_e[K]", "_rKK", "_r_KK", "_deK_dgK", "_eK_gK", "_w",
+const ENDS_OF_METHODS: [&str; 12] = [
+    "_g_K", "_gK", "_g[K]", "_e_K", "_eK", "_e[K]", "_rKK", "_r_KK", "_r[K]", "_deK_dgK", "_eK_gK",
+    "_w",
 ];
 
 // The prefix that the columns of a method share: `mcal` of `mcal_g_1`, `fpfs1` of `fpfs1_de1_dg1`, nothing of `e1`.
@@ -912,6 +913,7 @@ fn of_method<'f>(
 ) -> Option<&'f String> {
     use Role::{Dw1, Dw2, R11, R12, R21, R22, Weight};
     let names = recognised(key);
+    let free = |name: &str| free(name).filter(|own| is_of_whole_matrix(found, own));
     let mut all = names.iter().filter_map(|name| free(name));
     let (role, is_unsheared) = (key.0, key.1 == 0);
     let of = |key: Key| columns.get(&key).map_or("", String::as_str);
@@ -966,6 +968,17 @@ fn of_method<'f>(
                 .copied()
         }
         _ => all.next(),
+    }
+}
+
+// Whether a number of a vector `R` is one of four: other vectors are no responses, and `r[0]` is a radius.
+fn is_of_whole_matrix(found: &[String], name: &str) -> bool {
+    let is_there = |stem: &str, k: usize| found.contains(&format!("{stem}[{k}]"));
+    match name.split_once('[') {
+        Some((stem, _)) if format!("_{stem}").to_ascii_lowercase().ends_with("_r") => {
+            stem.ends_with('R') && is_there(stem, 3) && !is_there(stem, 4)
+        }
+        _ => true,
     }
 }
 
@@ -1716,6 +1729,25 @@ mod tests {
             (own.of(Role::E1), own.of(Role::R11)),
             (Some("wmom_g_1"), Some("wmom_R11"))
         );
+        for (columns, response) in [
+            (
+                "e1 e2 R[0] R[1] R[2] R[3]",
+                ["R[0]", "R[1]", "R[2]", "R[3]"].map(Some),
+            ),
+            ("e1 e2 r[0] r[1] r[2] r[3]", [None; 4]),
+            ("e1 e2 R[0] R[1] R[2] R[3] R[4]", [None; 4]),
+            ("e1 e2 R[0] R[1]", [None; 4]),
+            (
+                "mcal_e1 mcal_e2 e1 e2 mcal_R[0] mcal_R[1] mcal_R[2] mcal_R[3]",
+                ["mcal_R[0]", "mcal_R[1]", "mcal_R[2]", "mcal_R[3]"].map(Some),
+            ),
+        ] {
+            let own = found(columns, &[]).unwrap();
+            let roles = [Role::R11, Role::R12, Role::R21, Role::R22];
+            assert_eq!(roles.map(|role| own.of(role)), response, "{columns}");
+        }
+        let metacal = "e1 e2 mcal_e1 mcal_e2 mcal_e1_1p mcal_e1_1m mcal_e2_2p mcal_e2_2m";
+        assert_eq!(found(metacal, &[]).unwrap().of(Role::E1), Some("mcal_e1"));
         let mixed = "mcal_g_1 mcal_g_2 mcal_R11 R11 R22";
         assert!(found(mixed, &[]).unwrap_err().contains("none for R22"));
         let own = found("fpfs_e1 fpfs_e2 w fpfs_w", &[]).unwrap();

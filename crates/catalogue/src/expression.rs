@@ -686,7 +686,7 @@ impl<'a> Parser<'a> {
         let rest = self.rest();
         if number_length(rest) > 0 {
             let integer = rest[..number_length(rest)].parse::<i128>().ok();
-            let large = integer.filter(|own| own.unsigned_abs() >= MAX_EXACT_INTEGER as u128);
+            let large = integer.filter(|own| is_long(*own));
             return Ok(match (self.number()?, large) {
                 (_, Some(integer)) => Node::Integer(integer),
                 (number, None) => Node::Number(number),
@@ -884,9 +884,13 @@ pub fn integers_of<'f>(
     Some(Box::new(integers.iter().map(|own| own.map(i128::from))))
 }
 
+/// Whether floats merge an integer with others.
+pub fn is_long(integer: i128) -> bool {
+    integer.unsigned_abs() >= MAX_EXACT_INTEGER as u128
+}
+
 /// Whether a column has integers that floats do not contain.
 pub fn has_long_integers(frame: &DataFrame, name: &str) -> bool {
-    let is_long = |own: i128| own.unsigned_abs() >= MAX_EXACT_INTEGER as u128;
     integers_of(frame, name).is_some_and(|mut all| all.any(|own| own.is_some_and(is_long)))
 }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
-use shearq_catalogue::expression::{Expression, has_long_integers, integers_of, texts_of};
+use shearq_catalogue::expression::{Expression, has_long_integers, integers_of, is_long, texts_of};
 use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request};
 use shearq_catalogue::rows::rows;
 use shearq_catalogue::source::{Reading, Source, each_part, sources};
@@ -317,14 +317,14 @@ pub(super) fn with_numbers(
             continue;
         };
         let (mut texts, mut integers) = (BTreeSet::new(), BTreeSet::new());
-        let mut is_long = false;
+        let mut has_long = false;
         let mut add = |frame: &DataFrame| {
             match (texts_of(frame, name), integers_of(frame, name)) {
                 (Some(values), _) if texts.len() <= MAX_BINS => {
                     texts.extend(values.flatten().map(str::to_owned));
                 }
                 (None, Some(values)) if integers.len() <= MAX_BINS => {
-                    is_long |= has_long_integers(frame, name);
+                    has_long |= has_long_integers(frame, name);
                     integers.extend(values.flatten());
                 }
                 _ => {}
@@ -344,8 +344,10 @@ pub(super) fn with_numbers(
             }
         }
         let are_numbers = texts.iter().all(|text| text.trim().parse::<f64>().is_ok());
-        let by_texts = !texts.is_empty() && (has_texts || !are_numbers);
-        if !by_texts && !is_long {
+        // Floats would merge them.
+        let mut long = texts.iter().filter_map(|text| text.trim().parse().ok());
+        let by_texts = !texts.is_empty() && (has_texts || !are_numbers || long.any(is_long));
+        if !by_texts && !has_long {
             continue;
         }
         if texts.len().max(integers.len()) > MAX_BINS {
