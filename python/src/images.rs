@@ -7,17 +7,25 @@ use numpy::{IntoPyArray, PyArray3, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use shearq_pipeline::gather::{
-    Content, GatheredPixels, HeaderPixels, is_aligned, pixel_difference,
+    Content, GatheredPixels, HeaderPixels, PixelSize, is_aligned, pixel_difference,
+    scale_difference,
 };
 
 type Matrix2 = [[f64; 2]; 2];
-// Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, why they are not those of a cube's stamps, and messages.
+// Arcseconds per pixel, and OVERSAMP.
+type Size = (Option<f64>, Option<f64>);
+// Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, why they are not those of a cube's stamps, the size of pixels, and
+// messages.
 type Images<'py> = (
     Bound<'py, PyArray3<f32>>,
     Option<Bound<'py, PyArray3<f64>>>,
     Option<String>,
+    Size,
     Vec<String>,
 );
+
+// The same of one header, without pixels.
+type Header = (Option<Matrix2>, Option<String>, Size, Vec<String>);
 
 fn stacked<'py>(py: Python<'py>, matrices: Vec<Matrix2>) -> PyResult<Bound<'py, PyArray3<f64>>> {
     let count = matrices.len();
@@ -49,13 +57,16 @@ pub(crate) fn read_images<'py>(
         side,
         jacobians,
         fault_of_cube,
+        pixel_size,
         messages,
     } = found;
     let count = pixels.len() / (side * side);
     let pixels = ndarray::Array3::from_shape_vec((count, side, side), pixels);
     let pixels = pixels.map_err(|error| PyValueError::new_err(error.to_string()))?;
     let jacobians = jacobians.map(|all| stacked(py, all)).transpose()?;
-    Ok((pixels.into_pyarray(py), jacobians, fault_of_cube, messages))
+    let size = (pixel_size.scale, pixel_size.oversampling);
+    let pixels = pixels.into_pyarray(py);
+    Ok((pixels, jacobians, fault_of_cube, size, messages))
 }
 
 /// The Jacobian in the middle of images with a header of these cards, if it states one, why it is not that of a cube's, and what of
@@ -66,13 +77,29 @@ pub(crate) fn header_pixels(
     width: usize,
     height: usize,
     planes: usize,
-) -> PyResult<(Option<Matrix2>, Option<String>, Vec<String>)> {
+) -> PyResult<Header> {
     let HeaderPixels {
         jacobian,
         fault_of_cube,
+        pixel_size,
         doubts,
     } = HeaderPixels::from_cards(cards, [width, height], planes).map_err(PyValueError::new_err)?;
-    Ok((jacobian, fault_of_cube, doubts))
+    let size = (pixel_size.scale, pixel_size.oversampling);
+    Ok((jacobian, fault_of_cube, size, doubts))
+}
+
+/// The pixels of PSFs along a pixel of galaxies by the sizes that their headers state, and what is wrong with these.
+#[pyfunction]
+pub(crate) fn stated_oversampling(psf: Size, galaxies: Size) -> (Option<usize>, Option<String>) {
+    let (scale, oversampling) = psf;
+    let size = PixelSize {
+        scale,
+        oversampling,
+    };
+    let stated = size.oversampling_of(galaxies.0);
+    let scales = scale.zip(galaxies.0).filter(|_| stated.is_none());
+    let found = scales.and_then(|(psf, galaxies)| scale_difference(psf, galaxies));
+    (stated, found.map(|warning| warning.to_string()))
 }
 
 /// What is wrong with PSFs of these Jacobians for stamps of those.

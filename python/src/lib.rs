@@ -30,7 +30,9 @@ mod _shearq {
     #[pymodule_export]
     use super::detect::detect;
     #[pymodule_export]
-    use super::images::{are_aligned, header_pixels, pixel_difference_of, read_images};
+    use super::images::{
+        are_aligned, header_pixels, pixel_difference_of, read_images, stated_oversampling,
+    };
     #[pymodule_export]
     use super::measure::{flags, mean_shear, measure, psfs_from_oversampled};
     #[pymodule_export]

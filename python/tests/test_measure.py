@@ -358,6 +358,31 @@ def test_oversampled_psfs_are_those_on_galaxy_pixels():
     np.testing.assert_allclose(some["e1"], native["e1"], atol=1e-3)
 
 
+def test_headers_state_sizes_of_pixels(tmp_path):
+    fits = pytest.importorskip("astropy.io.fits")
+    image = shearq.simulate(set=8, grid=8)[0]
+    fine = gaussian_psf(1.45, 48, 2)
+    expected = shearq.measure(image.stamps, fine, noise=1.0, psf_oversampling=2)
+    psf = fits.PrimaryHDU(fine, fits.Header({"OVERSAMP": 2, "PIXELSCL": 0.1}))
+    psf.writeto(tmp_path / "psf.fits")
+    stamps = fits.PrimaryHDU(image.stamps, fits.Header({"PIXSCALE": 0.2}))
+    for given in (psf, tmp_path / "psf.fits"):
+        with pytest.warns(shearq.DataWarning, match="has 2 × 2 pixels for a pixel of the galaxies"):
+            found = shearq.measure(stamps, given, noise=1.0)
+        np.testing.assert_array_equal(found["e1"], expected["e1"])
+    native = gaussian_psf(1.45, 48, 1)
+    other = fits.PrimaryHDU(native, fits.Header({"SECPIX": 0.25}))
+    with pytest.warns(shearq.DataWarning, match="different pixel scales .found 0.25, expected 0.2 "):
+        shearq.measure(stamps, other, noise=1.0)
+    # OVERSAMP that the scales contradict.
+    for scale in (0.2, 0.3):
+        contradicted = fits.PrimaryHDU(native, fits.Header({"OVERSAMP": 4, "PIXELSCL": scale}))
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            shearq.measure(stamps, contradicted, noise=1.0)
+        assert any("different pixel scales" in str(one.message) for one in found) == (scale == 0.3)
+
+
 def test_oversampling_needs_images_of_whole_pixels():
     image = shearq.simulate(set=8, grid=8)[0]
     with pytest.raises(ValueError, match="oversampled PSF"):

@@ -32,6 +32,8 @@ const BLOCKS_PER_SIDE: usize = 4; // At least, on small stamps. Chosen by hand.
 const BANDING: f64 = 0.004;
 // The same of the other direction in units of it, below which it is banding and not noise of large scale. Chosen by hand.
 const BANDING_ACROSS: f64 = 0.33;
+// Of four Gaussian numbers of variance 1.
+const VARIANCE_OF_MEDIAN_OF_FOUR: f64 = 0.298;
 // Share of the long correlation that a scatter of the stamps' levels explains, from which it is one. Chosen by hand.
 const LEVELS_SHARE: f64 = 0.5;
 // Distances in px of pixel pairs that show long correlations: next to the distances that the survey covers.
@@ -675,16 +677,20 @@ impl Examination {
         }
         let (corners, _) = self.scatter_of(|stamp| stamp.corner)?;
         let (sides, _) = self.scatter_of(|stamp| stamp.side)?;
+        let (across, _) = self.scatter_of(|stamp| stamp.saddle)?;
         let (levels, of_sides) = (corners / noise, sides / noise);
-        // The median of four corners is about the mean of two.
-        let of_noise = 0.5 / (self.block * self.block) as f64;
+        // The sum of four corners has twice the scatter of one.
+        let apart = 2.0 * (self.stamp.side - self.block) as f64;
+        let of_noise = VARIANCE_OF_MEDIAN_OF_FOUR * (0.5 * apart * across / noise).powi(2);
         // The wings of galaxies are fainter in the corners.
         let is_sky = levels > WINGS_RATIO * of_sides;
         if is_sky && levels * levels - of_noise > LEVELS_SHARE * correlation {
             return Some(Warning::SkyLevels { scatter: levels });
         }
-        // Wings of galaxies without noise have more power than the fits that remove them leave for noise.
-        (correlation < 1.0).then_some(Warning::LongCorrelation { correlation })
+        // Wings of galaxies without noise have more power than the fits that remove them leave for noise. What a block shares is
+        // no part of its noise.
+        let correlation = correlation / (1.0 + correlation);
+        (is_sky || correlation < 0.5).then_some(Warning::LongCorrelation { correlation })
     }
 
     /// The scatter over stamps, and the number of those that have the quantity.

@@ -20,13 +20,16 @@ use shearq_measure::{Examination, PixelFrame, Warning};
 use shearq_quantities::Frame;
 use shearq_quantities::linear::Matrix2;
 
-pub use self::array::{GatheredPixels, HeaderPixels, is_aligned, pixel_difference};
+pub use self::array::{
+    GatheredPixels, HeaderPixels, is_aligned, pixel_difference, scale_difference,
+};
 pub(crate) use self::exposure::Exposure;
 pub(crate) use self::files::PlaneReader;
 pub use self::files::{Content, Files};
 pub(crate) use self::maps::{another, lose};
 use self::model::Chip;
 use self::mosaic::{Rows, StampWriter, already};
+pub use self::plan::PixelSize;
 use self::plan::Plan;
 pub use self::positions::Table;
 use self::positions::{pixels_of_rows, rows_of_stamps};

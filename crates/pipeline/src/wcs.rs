@@ -148,11 +148,7 @@ impl Wcs {
 
     /// Warnings if the PSF and the galaxies state different pixels.
     pub(crate) fn disagreements(psf: &Self, galaxies: &Self) -> impl Iterator<Item = Warning> {
-        let scale = || {
-            let (psf, galaxies) = (psf.scale?, galaxies.scale?);
-            let differs = (psf / galaxies - 1.0).abs() > MIN_PIXEL_DIFFERENCE;
-            differs.then_some(Warning::PixelScale { psf, galaxies })
-        };
+        let scale = || scale_difference(psf.scale?, galaxies.scale?);
         let frames = || {
             let (psf, galaxies) = (psf.reference()?, galaxies.reference()?);
             regular_inverse(psf)?;
@@ -165,6 +161,12 @@ impl Wcs {
         };
         scale().into_iter().chain(frames())
     }
+}
+
+/// A warning if the pixels of a PSF and of galaxies have these scales in arcseconds.
+pub(crate) fn scale_difference(psf: f64, galaxies: f64) -> Option<Warning> {
+    let differs = (psf / galaxies - 1.0).abs() > MIN_PIXEL_DIFFERENCE;
+    differs.then_some(Warning::PixelScale { psf, galaxies })
 }
 
 /// Whether ellipticities along the pixel axes are ellipticities along the sky's.

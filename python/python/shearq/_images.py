@@ -42,11 +42,16 @@ def _of_model(path: str) -> str:
     return next((f". Try: psf={opener}({path!r}), with x= and y=" for card, opener in _MODELS.items() if card in start), "")
 
 
-def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float64] | None]:
-    """The pixels of a path or HDU and the Jacobians of its images; anything else as it is, without."""
+# What a header states: arcseconds per pixel, and OVERSAMP.
+_Size = tuple[float | None, float | None]
+_NO_SIZE: _Size = (None, None)
+
+
+def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float64] | None, _Size]:
+    """The pixels of a path or HDU, and the Jacobians of its images and the size of their pixels; anything else as it is, without."""
     if isinstance(value, (str, os.PathLike)):
         try:
-            pixels, matrices, fault, messages = _shearq.read_images(os.fspath(value), name == "psf")
+            pixels, matrices, fault, size, messages = _shearq.read_images(os.fspath(value), name == "psf")
         except ValueError as error:
             raise ValueError(f"{name}: {error}{_of_model(os.fspath(value)) if name == 'psf' else ''}") from None
     elif _is_hdu(value):
@@ -59,10 +64,10 @@ def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float
         cards = {card.keyword: f"'{card.value}'" if isinstance(card.value, str) else str(card.value) for card in value.header.cards if card.keyword}
         rows, columns = np.shape(pixels)[-2:]
         planes = len(pixels) if pixels.ndim == 3 else 1
-        matrix, fault, messages = _shearq.header_pixels(cards, columns, rows, planes)
+        matrix, fault, size, messages = _shearq.header_pixels(cards, columns, rows, planes)
         matrices = None if matrix is None else np.array([matrix])
     else:
-        return value, None
+        return value, None, _NO_SIZE
     if fault is not None and name == "stamps" and not has_wcs:
         raise ValueError(f"{name}: {fault}. Try: wcs=WCS(header) with x= and y=, or the array of pixels, for ellipticities along the pixel axes")
     for message in messages:
@@ -71,19 +76,28 @@ def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float
         pixels = pixels[0] if pixels.ndim == 3 and len(pixels) == 1 else pixels
     elif pixels.ndim == 2:
         pixels = pixels[np.newaxis]
-    return pixels, matrices
+    return pixels, matrices, size
 
 
-def opened(stamps: Any, psf: Any, wcs: Any) -> tuple[Any, Any, Any]:
-    """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS that is not given."""
-    stamps, own = _opened("stamps", stamps, wcs is not None)
-    psf, of_psf = _opened("psf", psf, wcs is not None)
+def opened(stamps: Any, psf: Any, wcs: Any, oversampling: int | None) -> tuple[Any, Any, Any, int | None]:
+    """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS and oversampling that are not given."""
+    stamps, own, size = _opened("stamps", stamps, wcs is not None)
+    psf, of_psf, psf_size = _opened("psf", psf, wcs is not None)
+    stated, fault = _shearq.stated_oversampling(psf_size, size)
+    if oversampling is None and stated is not None:
+        oversampling = stated
+        message = f"psf: has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP of its header states. psf_oversampling=1 ignores that"
+        warn(message, DataWarning)
+    is_fine = oversampling not in (None, 1)
+    if fault is not None and not is_fine and (own is None or of_psf is None):
+        warn(f"psf: {fault}", DataWarning)
     if own is not None:
-        if of_psf is not None:
+        # Headers of finer pixels state another scale.
+        if of_psf is not None and not is_fine:
             found = _shearq.pixel_difference(of_psf, own)
             if found is not None:
                 raise ValueError(f"psf: {found}")
         # As `gather` has it: pixels along the axes of the sky need no Jacobians.
         if wcs is None and not _shearq.are_aligned(own):
             wcs = own[0] if len(own) == 1 else own
-    return stamps, psf, wcs
+    return stamps, psf, wcs, oversampling

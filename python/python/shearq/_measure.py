@@ -118,7 +118,7 @@ def measure(
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
     pixel: PixelOfPsf | None = None,
-    psf_oversampling: int = 1,
+    psf_oversampling: int | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -174,7 +174,8 @@ def measure(
         Whether profiles of GalSim contain the pixel, as those interpolated from images of stars do. By default they are convolved
         with it, with a warning for such profiles.
     psf_oversampling : int, optional
-        Pixels of the PSF images along a pixel of the galaxies, of undersampled images. The PSFs are integrated over their fine
+        Pixels of the PSF images along a pixel of the galaxies, of undersampled images; by default OVERSAMP of the header of a path
+        or HDU, or 1. The PSFs are integrated over their fine
         pixels, as GalSim and STPSF draw them, and are integrated over the galaxies' pixels here, without aliases.
     submission : str, path, mapping or Configuration
         The configuration: see :func:`submission`.
@@ -232,7 +233,7 @@ def measure(
         _doubt_mask(mask)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
-    if psf_oversampling != 1:
+    if psf_oversampling is not None:
         given["psf_oversampling"] = psf_oversampling
     for name, value in given.items():
         if value is not None:
@@ -253,7 +254,7 @@ def measure_blocks(
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
     pixel: PixelOfPsf | None = None,
-    psf_oversampling: int = 1,
+    psf_oversampling: int | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -361,7 +362,7 @@ def _pixels(
     stamps: Any, psf: Any, wcs: Any, x: Any, y: Any, properties: Any, pixel: PixelOfPsf | None, oversampling: int | None
 ) -> tuple[Any, Any, Any]:
     """Stamps and PSFs of all kinds as arrays, or PSFs as formulas, and the WCS, which files may state."""
-    stamps, psf, wcs = _images.opened(stamps, psf, wcs)
+    stamps, psf, wcs, oversampling = _images.opened(stamps, psf, wcs, oversampling)
     fine = oversampling not in (None, 1)
     psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel, fine)
     if fine and _galsim._many(psf, _galsim._is_profile) is not None:

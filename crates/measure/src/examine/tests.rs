@@ -405,9 +405,9 @@ fn warnings_about_stamps_begin_at_their_limits() {
     begins_at(1.0 / 0.33, "banding", |ratio| {
         examined(|_, stamp| stamp.bands = [0.01, 0.01 / ratio]).warnings()
     });
-    // Half of the correlation, over the noise of the levels.
+    // Half of the correlation.
     begins_at(0.5, "sky-levels", |share| {
-        let levels = (share * 0.1 + 0.5 / 64.0).sqrt();
+        let levels = (share * 0.1_f64).sqrt();
         let change = |at: f64, stamp: &mut StampStatistics| {
             let level = 2.0 / 1.4826 * levels * at;
             (stamp.corner, stamp.side) = (level, level);
@@ -415,6 +415,18 @@ fn warnings_about_stamps_begin_at_their_limits() {
         };
         examined(change).warnings()
     });
+    // Strongly correlated noise scatters corners, their median and their differences.
+    let smooth = examined(|at, stamp| {
+        let level = 2.0 / 1.4826 * at;
+        (stamp.corner, stamp.side) = (level, level);
+        stamp.saddle = 4.0 * level / (2.0 * 40.0);
+        stamp.pairs[0] = 200.0;
+    });
+    let kinds: Vec<&str> = smooth.warnings().iter().map(|one| one.kind()).collect();
+    assert!(
+        kinds.contains(&"long-correlation") && !kinds.contains(&"sky-levels"),
+        "{kinds:?}"
+    );
     begins_at(0.02, "given-noise", |difference| {
         let given = examined(|_, _| {}).given_noise(1.0 + difference);
         given.into_iter().collect()

@@ -9,7 +9,7 @@ use shearq_quantities::linear::Matrix2;
 
 use super::files::{Content, Files, PlaneReader};
 use super::mosaic::central;
-use super::plan::Stack;
+use super::plan::{PixelSize, Stack};
 use crate::wcs::{self, Keys, Wcs};
 
 /// Square images of a file.
@@ -22,6 +22,8 @@ pub struct GatheredPixels {
     pub jacobians: Option<Vec<Matrix2>>,
     /// Why the header of a cube does not state the pixels of its stamps.
     pub fault_of_cube: Option<String>,
+    /// Of the first image.
+    pub pixel_size: PixelSize,
     pub messages: Vec<String>,
 }
 
@@ -49,6 +51,7 @@ impl GatheredPixels {
             pixels,
             side: stack.side,
             jacobians: stack.pixels().into_iter().collect(),
+            pixel_size: stack.pixel_size(),
             fault_of_cube: stack.fault_of_cube,
             messages,
         })
@@ -62,6 +65,7 @@ pub struct HeaderPixels {
     pub jacobian: Option<Matrix2>,
     /// Why it is not that of several stamps.
     pub fault_of_cube: Option<String>,
+    pub pixel_size: PixelSize,
     /// What of the header is used against its name, or not used.
     pub doubts: Vec<String>,
 }
@@ -76,6 +80,8 @@ impl HeaderPixels {
         sides: [usize; 2],
         planes: usize,
     ) -> Result<Self, String> {
+        // Elsewhere the key may be a text.
+        let oversampling = cards.get("OVERSAMP").and_then(|value| value.parse().ok());
         let wcs = Wcs::of_keys(&Keys::new(cards));
         let middle = sides.map(|side| (side as f64 + 1.0) / 2.0);
         match wcs.fault() {
@@ -83,6 +89,10 @@ impl HeaderPixels {
             None => Ok(HeaderPixels {
                 jacobian: wcs.jacobian(middle),
                 fault_of_cube: wcs.fault_of_cube(planes, middle),
+                pixel_size: PixelSize {
+                    scale: wcs.scale(),
+                    oversampling,
+                },
                 doubts: wcs.doubts().to_vec(),
             }),
         }
@@ -94,6 +104,11 @@ pub fn pixel_difference(psfs: &[Matrix2], stamps: &[Matrix2]) -> Option<Warning>
     let count = psfs.len().max(stamps.len());
     let of = |all: &[Matrix2], k: usize| Some(Wcs::of_jacobian(*all.get(k).or(all.first())?));
     (0..count).find_map(|k| Wcs::disagreements(&of(psfs, k)?, &of(stamps, k)?).next())
+}
+
+/// What is wrong with a PSF on pixels of this scale in arcseconds for galaxies on pixels of that one.
+pub fn scale_difference(psf: f64, galaxies: f64) -> Option<Warning> {
+    wcs::scale_difference(psf, galaxies)
 }
 
 /// Whether ellipticities along pixels of this Jacobian are along the axes of the sky.

@@ -268,21 +268,39 @@ pub(super) struct Stack {
     pub(super) differs: Option<String>,
     /// What is wrong with the WCS of cubes.
     pub(super) fault_of_cube: Option<String>,
-    /// OVERSAMP of the first header, by which STPSF and WebbPSF state pixels of a PSF along a detector's.
+    /// OVERSAMP of the first header.
     oversampling: Option<f64>,
 }
 
-impl Stack {
-    /// The pixels of PSFs along a pixel of galaxies with this WCS that the header states, unless the pixel scales contradict it.
-    pub(super) fn oversampling_of(&self, galaxies: &Wcs) -> Option<usize> {
+/// What a header states of the size of its pixels.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PixelSize {
+    /// In arcseconds.
+    pub scale: Option<f64>,
+    /// OVERSAMP, by which STPSF and WebbPSF state pixels of a PSF along a detector's.
+    pub oversampling: Option<f64>,
+}
+
+impl PixelSize {
+    /// The pixels of PSFs along a pixel of galaxies of this scale, unless the scales contradict it.
+    pub fn oversampling_of(&self, galaxies: Option<f64>) -> Option<usize> {
         let stated = self
             .oversampling
             .filter(|stated| (2.0..=MAX_OVERSAMPLING).contains(stated) && stated.fract() == 0.0)?;
-        let scales = self.wcs.scale().zip(galaxies.scale());
-        let agrees = scales.is_none_or(|(psf, galaxies)| {
+        let agrees = self.scale.zip(galaxies).is_none_or(|(psf, galaxies)| {
             (stated * psf / galaxies - 1.0).abs() < MAX_SCALE_DIFFERENCE
         });
         agrees.then_some(stated as usize)
+    }
+}
+
+impl Stack {
+    /// What the first header states of the size of pixels.
+    pub(super) fn pixel_size(&self) -> PixelSize {
+        PixelSize {
+            scale: self.wcs.scale(),
+            oversampling: self.oversampling,
+        }
     }
 
     /// Jacobians of the stamps.

@@ -69,7 +69,7 @@ pub(super) fn gather_psfs(
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
     let (stack, mut messages) = Stack::of(files, square)?;
-    let stated = stack.oversampling_of(&plan.stack.wcs);
+    let stated = stack.pixel_size().oversampling_of(plan.stack.wcs.scale());
     let oversampling = match (gathering.psf_oversampling, stated) {
         (None, Some(stated)) => {
             messages.push(format!(
