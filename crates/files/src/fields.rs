@@ -34,10 +34,10 @@ impl Wanted {
     pub(crate) fn short(&self, path: &Path, fault: &str) -> FileError {
         let name = self.field.name.as_str();
         let message = format!(
-            "column `{name}`: {fault}, as `{}` needs. Try: a column of numbers in place of lists",
+            "column `{name}`: {fault}, as `{}` needs",
             element_name(name, self.element.unwrap_or_default())
         );
-        FileError::new(path, message)
+        FileError::new(path, message).hint("a column of numbers in place of lists")
     }
 
     /// The numbers of decoded vectors; other columns as they are.
@@ -245,12 +245,13 @@ pub(crate) fn with_missing(path: &Path, column: Series) -> Result<Column, FileEr
             let exact = numbers.filter(|all| !all.iter().any(|own| own.abs() >= MAX_EXACT_INTEGER));
             return match exact {
                 Some(numbers) => Ok(Column::new(name.into(), numbers.into_owned())),
-                None => Err(FileError::new(
-                    path,
-                    format!(
-                        "column `{name}` has {count} missing value(s) (expected them in columns of floats, of integers below 2⁵³ or of truth values, where they become NaN). Try: the table without these rows, or with values for them"
-                    ),
-                )),
+                None => {
+                    let message = format!(
+                        "column `{name}` has {count} missing value(s) (expected them in columns of floats, of integers below 2⁵³ or of truth values, where they become NaN)"
+                    );
+                    Err(FileError::new(path, message)
+                        .hint("the table without these rows, or with values for them"))
+                }
             };
         }
     };

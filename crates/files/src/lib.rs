@@ -7,6 +7,7 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use shearq_quantities::tried;
 use thiserror::Error;
 
 pub use fields::panic_is_caught;
@@ -71,6 +72,13 @@ impl FileError {
         }
     }
 
+    /// About `path`, from an error whose text ends with its `hint`.
+    pub fn with_hint(path: impl AsRef<Path>, error: &impl Display, hint: Option<String>) -> Self {
+        let text = error.to_string();
+        let message = text.strip_suffix(&tried(hint.as_ref())).unwrap_or(&text);
+        FileError::new(path, message).hint_if(hint)
+    }
+
     /// With what the user can try, in place of an earlier hint.
     #[must_use]
     pub fn hint(self, hint: impl Into<String>) -> Self {
@@ -80,12 +88,17 @@ impl FileError {
         }
     }
 
+    /// With what the user can try, if anything.
+    #[must_use]
+    pub fn hint_if(self, hint: Option<String>) -> Self {
+        FileError { hint, ..self }
+    }
+
     /// The message with the hint, without the path.
     pub fn text(&self) -> String {
-        match &self.hint {
-            Some(hint) => format!("{}. Try: {hint}", self.message),
-            None => self.message.clone(),
-        }
+        let text = self.message.clone() + &tried(self.hint.as_ref());
+        // A question has its mark.
+        text.replace("?. Try: ", "? Try: ")
     }
 
     /// The same about another path, such as that of an archive for a file in it.

@@ -317,7 +317,7 @@ impl<'a> Source<'a> {
         if let (true, Some(sum)) = (is_marked, tail.first_chunk()) {
             let footer = &tail[MARKED_SUM_BYTES..tail.len() - END_BYTES];
             check_sum(footer, u32::from_le_bytes(*sum))
-                .map_err(|error| damaged(path, format!("footer: {error}")))?;
+                .map_err(|error| damaged(path, format!("footer: {error}")).hint(COPY_AGAIN))?;
         }
         let (footer, fields) = guarded("footer", || {
             let mut reader = ParquetReader::new(Cursor::new(&tail));
@@ -454,7 +454,7 @@ impl<'a> Source<'a> {
             .read_bytes(start, chunk.compressed_size())
             .map_err(damaged)?;
         if let Some(&sum) = self.checksums.get(&start) {
-            check_sum(&bytes, sum).map_err(damaged)?;
+            check_sum(&bytes, sum).map_err(|error| damaged(error).hint(COPY_AGAIN))?;
         }
         let series = guarded(&place, || decode(chunk, bytes, field, most))
             .map_err(|detail| self::damaged(path, detail))?;
@@ -493,12 +493,14 @@ impl<'a> Source<'a> {
     }
 }
 
+const COPY_AGAIN: &str = "copy or measure it again";
+
 fn check_sum(bytes: &[u8], expected: u32) -> Result<(), String> {
     let found = crc32(bytes);
     match found == expected {
         true => Ok(()),
         false => Err(format!(
-            "its bytes changed after they were written (found CRC-32 {found:08x}, expected {expected:08x}). Try: copy or measure it again"
+            "its bytes changed after they were written (found CRC-32 {found:08x}, expected {expected:08x})"
         )),
     }
 }

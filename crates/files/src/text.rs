@@ -579,8 +579,9 @@ impl<'a> Rows<'a> {
         }
         // VizieR's tables have lines of units and of dashes below the names.
         if value(&field.replacen(',', ".", 1)).is_some_and(|own| !own.is_nan()) {
-            message += ". Try: numbers with decimal points";
-        } else if self.rows == 1 && line > 1 && !field.is_empty() {
+            return FileError::new(self.path, message).hint("numbers with decimal points");
+        }
+        if self.rows == 1 && line > 1 && !field.is_empty() {
             message +=
                 ". If it is one of units or dashes below the names, try: the table without it";
         }

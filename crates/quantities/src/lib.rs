@@ -18,6 +18,8 @@
 #![warn(missing_docs, clippy::missing_errors_doc)]
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
+use std::fmt::Display;
+
 mod ellipticity;
 pub mod fourier;
 pub mod hash;
@@ -32,6 +34,27 @@ pub use ellipticity::{
 };
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Pupil, TransformedPsf};
 pub use statistics::MeasuredRange;
+
+/// The end of a message, with what can be tried: empty without a hint.
+pub fn tried(hint: Option<impl Display>) -> String {
+    hint.map_or_else(String::new, |hint| format!(". Try: {hint}"))
+}
+
+/// The method `hint` of an enumeration of errors or warnings, from arms of a match that give texts or return.
+#[macro_export]
+macro_rules! hints {
+    ($($arms:tt)*) => {
+        /// What can be tried about it.
+        #[allow(unreachable_patterns)] // Behind arms for all variants.
+        pub fn hint(&self) -> Option<String> {
+            let hint: &str = match self {
+                $($arms)*
+                _ => return None,
+            };
+            Some(hint.to_owned())
+        }
+    };
+}
 
 /// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
 pub fn columns_of(count: usize) -> usize {

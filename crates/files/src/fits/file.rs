@@ -286,13 +286,15 @@ fn check_header(source: &mut Source, start: u64, content: Content) -> Result<boo
                 // Entries of challenges, which strangers send, are tables: their compressed images never reach cfitsio.
                 "ZCMPTYPE" if content == Content::Table => {
                     return fault(format!(
-                        "the file has a compressed image (found ZCMPTYPE {value}, expected a FITS table). Try: funpack"
-                    ));
+                        "the file has a compressed image (found ZCMPTYPE {value}, expected a FITS table)"
+                    ))
+                    .map_err(|error| error.hint("funpack"));
                 }
                 "ZCMPTYPE" if !CODINGS.contains(&value.trim_matches(['\'', ' '])) => {
                     return fault(format!(
-                        "the header key ZCMPTYPE is {value}; expected RICE_1, GZIP_1 or GZIP_2. Try: funpack"
-                    ));
+                        "the header key ZCMPTYPE is {value}; expected RICE_1, GZIP_1 or GZIP_2"
+                    ))
+                    .map_err(|error| error.hint("funpack"));
                 }
                 "ZCMPTYPE" => is_rice |= value.contains("RICE"),
                 "ZVAL1" => block_pixels = block_pixels.min(value.parse().unwrap_or(0.0)),
@@ -660,9 +662,12 @@ impl File {
     }
 
     fn wrong_sum(&self, key: &str, found: u64, expected: &str) -> FileError {
-        self.fault(format!(
-            "the image of extension {} differs from its checksum {key} (found the sum {found}, expected {expected}): it is damaged, or a program changed it and kept the key. Try: another copy; or, if its pixels are right, fitscheck --write --force {}",
-            self.number_of_extension(),
+        let message = format!(
+            "the image of extension {} differs from its checksum {key} (found the sum {found}, expected {expected}): it is damaged, or a program changed it and kept the key",
+            self.number_of_extension()
+        );
+        self.fault(message).hint(format!(
+            "another copy; or, if its pixels are right, fitscheck --write --force {}",
             self.path().display()
         ))
     }

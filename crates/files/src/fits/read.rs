@@ -433,9 +433,13 @@ impl ImageReader {
                 let flux = asinh.flux((*pixel).into()) as f32;
                 if flux.is_infinite() {
                     let magnitude: f64 = (*pixel).into();
-                    return Err(self.file.fault(format!(
-                        "a pixel is {magnitude}, and the header has BSOFTEN (expected asinh magnitudes, as of Pan-STARRS). Try: remove BSOFTEN if the pixels are fluxes already"
-                    )));
+                    let message = format!(
+                        "a pixel is {magnitude}, and the header has BSOFTEN (expected asinh magnitudes, as of Pan-STARRS)"
+                    );
+                    return Err(self
+                        .file
+                        .fault(message)
+                        .hint("remove BSOFTEN if the pixels are fluxes already"));
                 }
                 *pixel = flux.into();
             }
@@ -612,13 +616,13 @@ fn go_to_table(
                 None => "tables have these columns".into(),
             };
             let chosen: Vec<TableHead> = chosen.iter().map(|head| (*head).clone()).collect();
-            return Err(file.fault(format!(
-                "{} {what} ({}); expected one. Try: {}[{}]",
-                chosen.len(),
-                list_of(&chosen),
-                file.path().display(),
-                chosen[0].number
-            )));
+            return Err(file
+                .fault(format!(
+                    "{} {what} ({}); expected one",
+                    chosen.len(),
+                    list_of(&chosen)
+                ))
+                .hint(format!("{}[{}]", file.path().display(), chosen[0].number)));
         }
     };
     file.go_to(number)
@@ -710,16 +714,19 @@ fn choose_columns(
         let number = found.is_number() && (found.repeat == 1 || found.name.ends_with(']'));
         if !(number || text) {
             let by_column = found.repeat > MAX_VECTOR && file.rows()? == 1;
-            return Err(file.fault(match by_column {
-                true => format!(
-                    "column `{name}` holds all its values in one row, as in colfits, which is not read (expected one number per row). Try: stilts tcopy in={} out=table.fits ofmt=fits",
-                    path.display()
-                ),
-                false if found.kind == TBIT => format!(
-                    "column `{name}` holds bits (TFORM `X`, expected one number per row). Try: a column of integers, such as numpy.packbits gives, or --columns flag=none"
-                ),
-                false => format!("column `{name}` does not hold one number per row"),
-            }));
+            return Err(match by_column {
+                true => file
+                    .fault(format!(
+                        "column `{name}` holds all its values in one row, as in colfits, which is not read (expected one number per row)"
+                    ))
+                    .hint(format!("stilts tcopy in={} out=table.fits ofmt=fits", path.display())),
+                false if found.kind == TBIT => file
+                    .fault(format!(
+                        "column `{name}` holds bits (TFORM `X`, expected one number per row)"
+                    ))
+                    .hint("a column of integers, such as numpy.packbits gives, or --columns flag=none"),
+                false => file.fault(format!("column `{name}` does not hold one number per row")),
+            });
         }
         chosen.push(found);
     }
