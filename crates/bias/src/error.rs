@@ -1,5 +1,6 @@
 //! Why there is no estimate.
 
+use shearq_quantities::{hints, tried};
 use thiserror::Error;
 
 use crate::sums::Layout;
@@ -24,7 +25,7 @@ pub enum BiasError {
         name: &'static str,
     },
     /// The mean response is not positive by five standard errors. A ratio with such a divisor has no finite variance.
-    #[error("{}", response(*component, *found, *error))]
+    #[error("{}{}", response(*component, *found, *error), tried(self.hint()))]
     Response {
         /// Component, 1 or 2.
         component: usize,
@@ -59,14 +60,24 @@ pub enum BiasError {
     },
 }
 
+impl BiasError {
+    hints! {
+        Self::Response { component: k, found, error } if is_negative(*found, *error) => &format!("minus R{k}{k}, or exchange their columns"),
+    }
+}
+
 // Chosen by hand. The relative bias of a ratio is the square of the relative error of its divisor: 4 % at 5σ.
 pub(crate) const MIN_FITTED_RESPONSE_SIGNIFICANCE: f64 = 5.0;
 
+fn is_negative(found: f64, error: f64) -> bool {
+    found < -MIN_FITTED_RESPONSE_SIGNIFICANCE * error
+}
+
 fn response(component: usize, found: f64, error: f64) -> String {
     let expected = format!("expected more than {MIN_FITTED_RESPONSE_SIGNIFICANCE} standard errors");
-    if found < -MIN_FITTED_RESPONSE_SIGNIFICANCE * error {
+    if is_negative(found, error) {
         return format!(
-            "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the sheared catalogues of positive and negative shear are exchanged. Try: minus R{component}{component}, or exchange their columns"
+            "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the sheared catalogues of positive and negative shear are exchanged"
         );
     }
     format!(

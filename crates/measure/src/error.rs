@@ -1,6 +1,7 @@
 //! What can be wrong with a request.
 
 use shearq_quantities::{JacobianError, ProfileError};
+use shearq_quantities::{hints, tried};
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
@@ -36,8 +37,8 @@ pub enum MeasureError {
     Noise(String),
     /// Stamps on whose borders the noise cannot be measured.
     #[error(
-        "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise). Try: stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels (cut off, or left out by a settings file with a smaller stamp.size); for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
-        match incomplete { 0 => String::new(), count => format!(", {count} of them with missing pixels") }
+        "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise){}",
+        match incomplete { 0 => String::new(), count => format!(", {count} of them with missing pixels") }, tried(self.hint())
     )]
     NoBorders { examined: usize, incomplete: usize },
     /// More galaxies than fit into memory.
@@ -47,9 +48,7 @@ pub enum MeasureError {
     #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
     DarkPsf(f64),
     /// A star so near an edge of its stamp that it cannot be cut around itself.
-    #[error(
-        "the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star. Try: a larger PSF stamp, or one that is centred on the star to within 1 px"
-    )]
+    #[error("the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star{}", tried(self.hint()))]
     OffCentre {
         dx: f64,
         dy: f64,
@@ -62,15 +61,10 @@ pub enum MeasureError {
     #[error(transparent)]
     Jacobian(#[from] JacobianError),
     /// A configuration of exposures, which measures no stamps.
-    #[error(
-        "the configuration detects on exposures; expected one that measures stamps, such as 48/linear/star. Try: shearq detect"
-    )]
+    #[error("the configuration detects on exposures; expected one that measures stamps, such as 48/linear/star{}", tried(self.hint()))]
     NoStamps,
     /// Pixels that are sheared more than the method can use.
-    #[error(
-        "pixels are sheared by {shear:.2e} on the sky; expected at most {most}, as the configuration requires. Try: {}",
-        if *most < 0.1 { "a linear configuration, such as 48/linear/star" } else { "resampled images" }
-    )]
+    #[error("pixels are sheared by {shear:.2e} on the sky; expected at most {most}, as the configuration requires{}", tried(self.hint()))]
     ShearedPixels {
         /// |g| of the shear that makes such pixels of squares.
         shear: f64,
@@ -107,9 +101,7 @@ pub enum EpochError {
     )]
     Noise { epoch: usize, noise: f64 },
     /// A galaxy that is not near the middle of its stamp.
-    #[error(
-        "the galaxy of epoch {epoch} is ({x}, {y}) px from the centre of its stamp (expected up to {most}). Try: stamps that are cut around the galaxy"
-    )]
+    #[error("the galaxy of epoch {epoch} is ({x}, {y}) px from the centre of its stamp (expected up to {most}){}", tried(self.hint()))]
     Offset {
         epoch: usize,
         x: f64,
@@ -117,18 +109,32 @@ pub enum EpochError {
         most: f64,
     },
     /// Epochs in the frame of the sky and of the pixels.
-    #[error(
-        "some epochs have Jacobians and others have none (expected Jacobians for all or for none). Try: a WCS for each epoch, or none; exposures of one call of gather have either"
-    )]
+    #[error("some epochs have Jacobians and others have none (expected Jacobians for all or for none){}", tried(self.hint()))]
     Frames,
     /// A method that is not linear.
-    #[error(
-        "the configuration measures with the network, which combines no epochs. Try: a linear configuration, such as 48/linear/star"
-    )]
+    #[error("the configuration measures with the network, which combines no epochs{}", tried(self.hint()))]
     Network,
 }
 
+impl EpochError {
+    hints! {
+        Self::Offset { .. } => "stamps that are cut around the galaxy",
+        Self::Frames => "a WCS for each epoch, or none; exposures of one call of gather have either",
+        Self::Network => "a linear configuration, such as 48/linear/star",
+    }
+}
+
 impl MeasureError {
+    hints! {
+        Self::Epochs(error) => return error.hint(),
+        Self::Data(warning) => return warning.hint(),
+        Self::NoBorders { .. } => "stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels (cut off, or left out by a settings file with a smaller stamp.size); for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
+        Self::OffCentre { .. } => "a larger PSF stamp, or one that is centred on the star to within 1 px",
+        Self::NoStamps => "shearq detect",
+        Self::ShearedPixels { most, .. } if *most < 0.1 => "a linear configuration, such as 48/linear/star",
+        Self::ShearedPixels { .. } => "resampled images",
+    }
+
     /// A square image, or several, of the wrong sizes.
     pub(crate) fn square(
         what: &'static str,

@@ -5,6 +5,7 @@
 use std::fmt;
 
 use shearq_quantities::linear::{Matrix2, determinant, inverse, product};
+use shearq_quantities::{hints, tried};
 use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
 use thiserror::Error;
@@ -23,7 +24,7 @@ use crate::measurement::{DefectCounts, Flag, Measurement};
 )]
 pub enum Warning {
     /// The corners of the stamps are brighter or darker than zero.
-    #[error("the stamps contain sky {}", sky(*level, *error, *noise, *share, *subtracted))]
+    #[error("the stamps contain sky {}{}", sky(*level, *error, *noise, *share, *subtracted), tried(self.hint()))]
     Sky {
         /// Mean level in image units.
         level: f64,
@@ -36,7 +37,7 @@ pub enum Warning {
         subtracted: bool,
     },
     /// The level of the stamps' corners changes along x or y.
-    #[error("the sky has a gradient {}", gradient(*slope, *error, *noise, *subtracted))]
+    #[error("the sky has a gradient {}{}", gradient(*slope, *error, *noise, *subtracted), tried(self.hint()))]
     Gradient {
         /// Change per pixel along x and y, in image units.
         slope: [f64; 2],
@@ -47,57 +48,42 @@ pub enum Warning {
         subtracted: bool,
     },
     /// The galaxies are not in the middle of their stamps.
-    #[error(
-        "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected the middle). Try: cut the stamps around the galaxies",
-        offset[0], offset[1]
-    )]
+    #[error("the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected the middle){}", offset[0], offset[1], tried(self.hint()))]
     OffCentre {
         /// Median of their centroids from the middle, along x and y in pixels.
         offset: [f64; 2],
         error: f64,
     },
     /// The galaxies are at different places of their stamps.
-    #[error(
-        "the galaxies are scattered over their stamps (found {:.1} px along x and {:.1} px along y; expected less than 2 px). Try: cut the stamps around the galaxies",
-        scatter[0], scatter[1]
-    )]
+    #[error("the galaxies are scattered over their stamps (found {:.1} px along x and {:.1} px along y; expected less than 2 px){}", scatter[0], scatter[1], tried(self.hint()))]
     PositionScatter {
         /// Scatter of their centroids along x and y in pixels.
         scatter: [f64; 2],
     },
     /// No pixel is left in the middle of galaxies.
-    #[error(
-        "the mask covers the centres of {count} of {of} stamps (found no pixel within 2 px of them; expected the galaxies, and a mask of bad pixels). Try: --mask-bits with the bits of bad pixels (without DETECTED), or a mask that is no segmentation map"
-    )]
+    #[error("the mask covers the centres of {count} of {of} stamps (found no pixel within 2 px of them; expected the galaxies, and a mask of bad pixels){}", tried(self.hint()))]
     MaskedGalaxies { count: usize, of: usize },
     /// Most galaxies are darker than their surroundings.
-    #[error(
-        "galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux). Try: check the sign of the image"
-    )]
+    #[error("galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux){}", tried(self.hint()))]
     Negative { count: usize, of: usize },
     /// The noise differs from stamp to stamp.
-    #[error(
-        "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: give the noise of each stamp (gather --variance or --weight-map, `noise` in Python), or put stamps of one depth into an image",
-        100.0 * scatter
-    )]
+    #[error("the noise differs between stamps (found a scatter of {:.0} %; expected one level){}", 100.0 * scatter, tried(self.hint()))]
     Depths {
         /// Scatter of the stamps' noise, in units of their median.
         scatter: f64,
     },
     /// Noise is correlated over more pixels than can be measured.
-    #[error(
-        "the noise is correlated over more than 3 px (found {correlation:.2} for pixels 4 and 5 px apart; expected 0). The response is corrected for shorter correlations only: m is -0.2 at S/N 20 and -0.03 at S/N 60 for noise smoothed by a Gaussian of σ = 2 px. Try: use images before resampling or smoothing"
-    )]
+    #[error("the noise is correlated over more than 3 px (found {correlation:.2} for pixels 4 and 5 px apart; expected 0). The response is corrected for shorter correlations only: m is -0.2 at S/N 20 and -0.03 at S/N 60 for noise smoothed by a Gaussian of σ = 2 px{}", tried(self.hint()))]
     LongCorrelation {
         /// Mean correlation of pixels four and five apart along an axis.
         correlation: f64,
     },
     /// Rows or columns of the image have levels of their own.
     #[error(
-        "the noise is banded (found {} with levels that differ by {scatter:.2} of the noise; expected one level), which changes c1 by about {:+.4} at S/N 20, and by a quarter of it at S/N 40. Try: subtract from each {} of the exposure its median, without the galaxies",
+        "the noise is banded (found {} with levels that differ by {scatter:.2} of the noise; expected one level), which changes c1 by about {:+.4} at S/N 20, and by a quarter of it at S/N 40{}",
         if *rows { "rows" } else { "columns" },
         if *rows { C1_BY_BANDING } else { -C1_BY_BANDING } * scatter * scatter,
-        if *rows { "row" } else { "column" }
+        tried(self.hint())
     )]
     Banding {
         /// Whether along rows, or else columns.
@@ -106,46 +92,32 @@ pub enum Warning {
         scatter: f64,
     },
     /// The stamps have skies of several levels.
-    #[error(
-        "the sky differs between stamps (found levels with a scatter of {scatter:.2} of the noise; expected one level). Try: --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  noise.sky = \"stamp\""
-    )]
+    #[error("the sky differs between stamps (found levels with a scatter of {scatter:.2} of the noise; expected one level){}", tried(self.hint()))]
     SkyLevels {
         /// In units of the noise of a pixel.
         scatter: f64,
     },
     /// The skies of the stamps have several slopes.
-    #[error(
-        "the slope of the sky differs between stamps (found a scatter of {scatter:.4} of the noise per pixel; expected none), which changes m by about {m:.3}. Try: --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  noise.sky = \"stamp\""
-    )]
+    #[error("the slope of the sky differs between stamps (found a scatter of {scatter:.4} of the noise per pixel; expected none), which changes m by about {m:.3}{}", tried(self.hint()))]
     SkySlopes {
         /// Along an axis, in units of the noise of a pixel per pixel.
         scatter: f64,
         m: f64,
     },
     /// The network stopped before its first iteration on most galaxies.
-    #[error(
-        "the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved. Try: other values of deconvolution.step and deconvolution.lambda"
-    )]
+    #[error("the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved{}", tried(self.hint()))]
     Idle { count: usize, of: usize },
     /// The mean response of the galaxies is not positive by three standard errors.
-    #[error(
-        "the mean response to shear is not positive by 3 standard errors (found {:.3}, {:.3}). Try: check that the PSF has the pixel scale of the galaxies, and that there are galaxies", response[0], response[1]
-    )]
+    #[error("the mean response to shear is not positive by 3 standard errors (found {:.3}, {:.3}){}", response[0], response[1], tried(self.hint()))]
     NoResponse { response: [f64; 2] },
     /// Stamps are copies of other stamps.
-    #[error(
-        "stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small. Try: remove repeated galaxies"
-    )]
+    #[error("stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small{}", tried(self.hint()))]
     Copies { count: usize, of: usize },
     /// All pixels of a stamp are equal, on every stamp examined.
-    #[error(
-        "the stamps are blank (found equal pixels on each of {of} stamps; expected a galaxy and noise). Try: check the file and its extension"
-    )]
+    #[error("the stamps are blank (found equal pixels on each of {of} stamps; expected a galaxy and noise){}", tried(self.hint()))]
     Blank { of: usize },
     /// Pixel values are too small or large for single precision.
-    #[error(
-        "pixel values are out of range (found brightest pixels of about {peak:.1e}; expected 1e-18 to 1e17). Try: divide the image and its noise by a constant"
-    )]
+    #[error("pixel values are out of range (found brightest pixels of about {peak:.1e}; expected 1e-18 to 1e17){}", tried(self.hint()))]
     Brightness {
         /// Median of the stamps' brightest pixels.
         peak: f64,
@@ -162,16 +134,10 @@ pub enum Warning {
         used: bool,
     },
     /// The noise of the stamps disagrees with the one in the call.
-    #[error(
-        "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. {}",
-        significant(*given, 5), significant(*measured, 5), noise_advice(*given, *measured)
-    )]
+    #[error("the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears{}{}", significant(*given, 5), significant(*measured, 5), noise_advice(*given, *measured).0, tried(self.hint()))]
     GivenNoise { given: f64, measured: f64 },
     /// Noise is correlated, and the configuration treats it as white.
-    #[error(
-        "the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0). Try: set noise.source to \"image\" and noise.correlation above 0",
-        correlation[0], correlation[1]
-    )]
+    #[error("the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0){}", correlation[0], correlation[1], tried(self.hint()))]
     CorrelatedNoise {
         /// Correlation of neighbours along x and y.
         correlation: [f64; 2],
@@ -184,24 +150,19 @@ pub enum Warning {
         warning: Box<Warning>,
     },
     /// Noise of an epoch is correlated, and all epochs are combined as white noise.
-    #[error(
-        "the noise of neighbouring pixels is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0). Try: exposures that were not resampled",
-        correlation[0], correlation[1]
-    )]
+    #[error("the noise of neighbouring pixels is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0){}", correlation[0], correlation[1], tried(self.hint()))]
     EpochNoise {
         /// Correlation of neighbours along x and y.
         correlation: [f64; 2],
     },
     /// The noise of an epoch cannot be measured.
-    #[error(
-        "cannot measure the noise: on no stamp are there enough pixels that differ and are not missing (expected galaxies and noise). The epoch is left out. Try: check the file, its extension and its mask"
-    )]
+    #[error("cannot measure the noise: on no stamp are there enough pixels that differ and are not missing (expected galaxies and noise). The epoch is left out{}", tried(self.hint()))]
     EpochNoNoise,
     /// The galaxies of an epoch are not where its offsets and its PSF place them.
     #[error(
-        "the galaxies are displaced from {} (found {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected 0), which blurs the combined galaxies. Try: check sign, order and axes of the dithers or positions, and that the PSF is centred on its stamp",
+        "the galaxies are displaced from {} (found {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected 0), which blurs the combined galaxies{}",
         if *from_first { "those of the first epoch, beyond offsets and PSFs" } else { "the offsets that are stated" },
-        offset[0], offset[1]
+        offset[0], offset[1], tried(self.hint())
     )]
     EpochOffset {
         /// Median displacement along x and y in pixels.
@@ -211,39 +172,25 @@ pub enum Warning {
         from_first: bool,
     },
     /// PSFs of one galaxy each have their centroids at several places, from which the galaxies are not counted.
-    #[error(
-        "the PSFs are at several places of their stamps (found a scatter of {scatter:.2} px, which the galaxies do not have beyond their offsets; expected PSFs in the middle). Deconvolution moves each galaxy with its PSF, which blurs the combined galaxies. Try: PSFs in the middle of their stamps, or offsets of the galaxies less those of their PSFs"
-    )]
+    #[error("the PSFs are at several places of their stamps (found a scatter of {scatter:.2} px, which the galaxies do not have beyond their offsets; expected PSFs in the middle). Deconvolution moves each galaxy with its PSF, which blurs the combined galaxies{}", tried(self.hint()))]
     ScatteredPsfs {
         /// Root mean square in pixels along an axis.
         scatter: f64,
     },
     /// The galaxies of an epoch have another flux than in the first one.
-    #[error(
-        "the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux. Try: scale image, noise and gain to one zero point"
-    )]
+    #[error("the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux{}", tried(self.hint()))]
     EpochFlux { ratio: f64, error: f64 },
     /// An epoch has no light at the stated places of the galaxies, or the first epoch has none.
-    #[error(
-        "{} at the stated places (found no significant light there; expected the galaxies that {} shows). Try: check that image, WCS and dither belong together",
-        if *from_first { "the first epoch has no galaxies" } else { "there are no galaxies" },
-        if *from_first { "this epoch" } else { "the first epoch" }
-    )]
+    #[error("{} at the stated places (found no significant light there; expected the galaxies that {} shows){}", if *from_first { "the first epoch has no galaxies" } else { "there are no galaxies" }, if *from_first { "this epoch" } else { "the first epoch" }, tried(self.hint()))]
     EpochWithoutGalaxies { from_first: bool },
     /// An epoch contains other galaxies than the first one.
-    #[error(
-        "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together. Bands of galaxies with various colours may have this warning, too"
-    )]
+    #[error("{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies){}", tried(self.hint()))]
     EpochGalaxies { count: usize, of: usize },
     /// Stamps of an epoch are copies of stamps of an earlier one.
-    #[error(
-        "stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average. Try: remove one of the epochs"
-    )]
+    #[error("stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average{}", tried(self.hint()))]
     EpochCopies { count: usize, of: usize },
     /// No stamp is good enough to measure the noise on.
-    #[error(
-        "cannot measure the noise: on no stamp are there enough pixels that differ and are not missing. All galaxies are flagged. Try: cut off borders of missing pixels (with stamp.size of the smaller stamps in a settings file), and mask neighbours but not the sky and the galaxies"
-    )]
+    #[error("cannot measure the noise: on no stamp are there enough pixels that differ and are not missing. All galaxies are flagged{}", tried(self.hint()))]
     NoNoise,
     /// The star was not in the middle of its stamp, and was cut around itself.
     #[error(
@@ -256,10 +203,7 @@ pub enum Warning {
         of: ExaminedPsfs,
     },
     /// The PSF image contains a background.
-    #[error(
-        "the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
-        significant(100.0 * level, 3), 100.0 * share
-    )]
+    #[error("the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears{}", significant(100.0 * level, 3), 100.0 * share, tried(self.hint()))]
     PsfBackground {
         /// Level in units of the peak.
         level: f64,
@@ -269,12 +213,12 @@ pub enum Warning {
     },
     /// Pixels of the PSF have another value than the pixels around them allow.
     #[error(
-        "pixels of the PSF are not those of a star (found {}{of}; expected a smooth PSF). Dead pixels bias c by up to 0.01, dead rows m by 0.15, hot pixels m by 0.02, cores cut at 0.9 of the peak m by 0.02, at 0.7 by 0.08. Try: a model of the PSF, or other stars",
+        "pixels of the PSF are not those of a star (found {}{of}; expected a smooth PSF). Dead pixels bias c by up to 0.01, dead rows m by 0.15, hot pixels m by 0.02, cores cut at 0.9 of the peak m by 0.02, at 0.7 by 0.08{}",
         match (*dead, *hot) {
             (0, 0) => "several pixels of the brightest value".to_owned(),
             (0, hot) => format!("{hot} much brighter than those around them, {distance:.0} px from the centre"),
             (dead, _) => format!("{dead} much darker than those around them"),
-        }
+        }, tried(self.hint())
     )]
     PsfDefect {
         dead: usize,
@@ -284,10 +228,7 @@ pub enum Warning {
         of: ExaminedPsfs,
     },
     /// The background of the PSF image changes along x or y.
-    #[error(
-        "the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears. Try: subtract the background",
-        100.0 * slope[0], 100.0 * slope[1]
-    )]
+    #[error("the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears{}", 100.0 * slope[0], 100.0 * slope[1], tried(self.hint()))]
     PsfGradient {
         /// Change per pixel along x and y in units of the peak.
         slope: [f64; 2],
@@ -295,8 +236,8 @@ pub enum Warning {
     },
     /// Pixels hold no light and became missing.
     #[error(
-        "pixels hold no light (found {} on {stamps} of {of} stamps: {} in areas of one value, {} far below the sky, {} brighter than the PSF allows, {} on lines across the stamp; expected none). They count as missing; {flagged} of these galaxies are flagged. Try: replace such pixels by NaN, and cut stamps before a deblender fills them",
-        counts.total(), counts.repeated, counts.dark, counts.bright, counts.lines
+        "pixels hold no light (found {} on {stamps} of {of} stamps: {} in areas of one value, {} far below the sky, {} brighter than the PSF allows, {} on lines across the stamp; expected none). They count as missing; {flagged} of these galaxies are flagged{}",
+        counts.total(), counts.repeated, counts.dark, counts.bright, counts.lines, tried(self.hint())
     )]
     Defects {
         counts: DefectCounts,
@@ -306,41 +247,28 @@ pub enum Warning {
         of: usize,
     },
     /// Stamps show no light in their middle, more than by noise.
-    #[error(
-        "about {} of {of} stamps have no galaxy in their middle (found {count} with S/N below 0, where galaxies of S/N 5 have one in 10⁴). They add noise to mean shears, and to their response nothing. Try: check that the positions are those of galaxies on this image",
-        2 * count
-    )]
+    #[error("about {} of {of} stamps have no galaxy in their middle (found {count} with S/N below 0, where galaxies of S/N 5 have one in 10⁴). They add noise to mean shears, and to their response nothing{}", 2 * count, tried(self.hint()))]
     Empty { count: usize, of: usize },
     /// The brightest pixels of many stamps have one value.
-    #[error(
-        "the brightest pixel is {} on {count} of {of} stamps (expected different values), as if light above it were cut off, which biases shears. Try: replace saturated pixels by NaN",
-        significant(*level, 5)
-    )]
+    #[error("the brightest pixel is {} on {count} of {of} stamps (expected different values), as if light above it were cut off, which biases shears{}", significant(*level, 5), tried(self.hint()))]
     Saturated { level: f64, count: usize, of: usize },
     /// The brightest pixel of every stamp has one value.
-    #[error(
-        "the brightest pixel is {} on each of {of} stamps (expected different values), as if they were divided by it, so that each stamp has another noise. Try: stamps in one unit",
-        significant(*level, 5)
-    )]
+    #[error("the brightest pixel is {} on each of {of} stamps (expected different values), as if they were divided by it, so that each stamp has another noise{}", significant(*level, 5), tried(self.hint()))]
     PeakNormalised { level: f64, of: usize },
     /// Pixels below a level were replaced by it.
-    #[error(
-        "pixels are cut off from below (found {:.0} % of the pixels at the darkest value of their stamp, on {count} of {of} stamps; expected one pixel), which biases shears: m is about 0.1 if those below zero became zero, and 0.02 below −1 σ. Try: images whose negative pixels are kept",
-        100.0 * share
-    )]
+    #[error("pixels are cut off from below (found {:.0} % of the pixels at the darkest value of their stamp, on {count} of {of} stamps; expected one pixel), which biases shears: m is about 0.1 if those below zero became zero, and 0.02 below −1 σ{}", 100.0 * share, tried(self.hint()))]
     Clipped { share: f64, count: usize, of: usize },
     /// The brightest pixels of a stamp have one value, on many stamps.
-    #[error(
-        "several pixels have the brightest value of their stamp on {count} of {of} stamps (expected one pixel), as if light above it were cut off, which biases shears. Try: replace saturated pixels by NaN"
-    )]
+    #[error("several pixels have the brightest value of their stamp on {count} of {of} stamps (expected one pixel), as if light above it were cut off, which biases shears{}", tried(self.hint()))]
     FlatTops { count: usize, of: usize },
     /// The noise of the star biases shears.
     #[error(
-        "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}",
+        "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}{}",
         effect.map_or_else(
-            || "With a star of S/N 50 for each galaxy, m is right to 0.003 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others. Try: a model of the PSF, fitted to all stars".to_owned(),
-            |[m, c]| format!("The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"),
-        )
+            || "With a star of S/N 50 for each galaxy, m is right to 0.003 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others".to_owned(),
+            |[m, c]| format!("The noise of one star changes m by about {m:.3} and c by about {c:.3}"),
+        ),
+        tried(self.hint())
     )]
     PsfNoise {
         /// √(Σ p²)/σ.
@@ -362,8 +290,8 @@ pub enum Warning {
     },
     /// The PSF image ends where there is light.
     #[error(
-        "the PSF image is cut off (found {side:.0} px across, {} % of the peak at the edge and zeros beyond{of}; expected {MIN_PSF} px or more, or a smooth end). That changes m by about {:+.3}, and c by about {:.2} times the ellipticity of the PSF. Try: a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",
-        significant(100.0 * level, 2), effect[0], effect[1]
+        "the PSF image is cut off (found {side:.0} px across, {} % of the peak at the edge and zeros beyond{of}; expected {MIN_PSF} px or more, or a smooth end). That changes m by about {:+.3}, and c by about {:.2} times the ellipticity of the PSF{}",
+        significant(100.0 * level, 2), effect[0], effect[1], tried(self.hint())
     )]
     PsfTruncated {
         /// Pixels of the galaxies across the part that is not zero.
@@ -376,8 +304,8 @@ pub enum Warning {
     },
     /// The PSF is narrower than pixels can show.
     #[error(
-        "the PSF is narrower than the pixels can show (found a transform of {power:.2} at 2 rad/px{of}). Aliased light changes m by about {:+.3} and c by up to {:.3}, to a factor of 3: m is positive for a PSF on a corner of its pixels, and negative on a centre. Try: a PSF on finer pixels, with gather --psf-oversampling (psf_oversampling in Python); or check that the file is a PSF with the pixel scale of the galaxies",
-        effect[0], effect[1]
+        "the PSF is narrower than the pixels can show (found a transform of {power:.2} at 2 rad/px{of}). Aliased light changes m by about {:+.3} and c by up to {:.3}, to a factor of 3: m is positive for a PSF on a corner of its pixels, and negative on a centre{}",
+        effect[0], effect[1], tried(self.hint())
     )]
     PsfNarrow {
         /// Modulus of the transform, of sum one.
@@ -388,9 +316,9 @@ pub enum Warning {
     },
     /// The PSF is broader than the galaxies that were blurred by it.
     #[error(
-        "the PSF is {} the galaxies (found a FWHM of {psf:.2} px in the core, expected {} the {galaxies:.2} px of the galaxies). A PSF sampled with another pixel scale biases m by up to 10. Try: check the sampling of the PSF, and that the objects are not stars",
+        "the PSF is {} the galaxies (found a FWHM of {psf:.2} px in the core, expected {} the {galaxies:.2} px of the galaxies). A PSF sampled with another pixel scale biases m by up to 10{}",
         if *fatal { "broader than" } else { "nearly as broad as" },
-        if *fatal { "less than" } else { "clearly less than" }
+        if *fatal { "less than" } else { "clearly less than" }, tried(self.hint())
     )]
     PsfBroad {
         /// FWHM of its core in pixels.
@@ -401,10 +329,7 @@ pub enum Warning {
         fatal: bool,
     },
     /// The headers of the PSF image and of the galaxy image state different pixel scales.
-    #[error(
-        "the PSF image and the galaxy image have different pixel scales (found {}, expected {} arcsec per pixel). This can bias m by 0.1 or more. Try: resample the PSF to the pixels of the galaxies, or correct its header",
-        six_digits(*psf), six_digits(*galaxies)
-    )]
+    #[error("the PSF image and the galaxy image have different pixel scales (found {}, expected {} arcsec per pixel). This can bias m by 0.1 or more{}", six_digits(*psf), six_digits(*galaxies), tried(self.hint()))]
     PixelScale {
         /// Arcseconds per pixel of the PSF image.
         psf: f64,
@@ -412,10 +337,7 @@ pub enum Warning {
         galaxies: f64,
     },
     /// The header of a file states the set and image of another file.
-    #[error(
-        "the header of the {of} states another image (found SET = {} and IMAGE = {}, expected {} and {}). With galaxies or a PSF of another image shears are wrong. Try: put the files back, or correct the header",
-        stated[0], stated[1], expected[0], expected[1]
-    )]
+    #[error("the header of the {of} states another image (found SET = {} and IMAGE = {}, expected {} and {}). With galaxies or a PSF of another image shears are wrong{}", stated[0], stated[1], expected[0], expected[1], tried(self.hint()))]
     OtherImage {
         /// The content of the file: galaxies, or the PSF.
         of: &'static str,
@@ -425,23 +347,16 @@ pub enum Warning {
         expected: [u32; 2],
     },
     /// Ellipticities are along pixel axes that the header rotates, mirrors or shears against the sky's.
-    #[error(
-        "e1 and e2 are along the pixel axes, which are not the sky's (found {0}; expected 0°, not mirrored, no shear). Try: transform e1 and e2 with the WCS, or compare them with shears along the pixel axes"
-    )]
+    #[error("e1 and e2 are along the pixel axes, which are not the sky's (found {}; expected 0°, not mirrored, no shear){}", .0, tried(self.hint()))]
     PixelFrame(PixelFrame),
     /// The headers of the PSF image and of the galaxy image state pixel axes of different orientation or shear.
-    #[error(
-        "the PSF image and the galaxy image have pixel axes of different orientation or shear (found {psf}; expected {galaxies}). The PSF is deconvolved in the wrong orientation. Try: draw the PSF with the WCS of the galaxies, or correct its header"
-    )]
+    #[error("the PSF image and the galaxy image have pixel axes of different orientation or shear (found {psf}; expected {galaxies}). The PSF is deconvolved in the wrong orientation{}", tried(self.hint()))]
     PsfFrame {
         psf: PixelFrame,
         galaxies: PixelFrame,
     },
     /// One PSF is deconvolved from stamps whose pixels differ on the sky.
-    #[error(
-        "one PSF is for all stamps, whose pixels differ on the sky (found {first} at {:.4} arcsec per pixel, and {other} at {:.4}; expected a PSF per stamp). This is right only for a PSF that turns with the pixels. Try: a PSF on the pixels of each stamp",
-        scales[0], scales[1]
-    )]
+    #[error("one PSF is for all stamps, whose pixels differ on the sky (found {first} at {:.4} arcsec per pixel, and {other} at {:.4}; expected a PSF per stamp). This is right only for a PSF that turns with the pixels{}", scales[0], scales[1], tried(self.hint()))]
     SharedPsf {
         first: PixelFrame,
         other: PixelFrame,
@@ -449,18 +364,13 @@ pub enum Warning {
         scales: [f64; 2],
     },
     /// The configuration uses so little of the PSF that its wings are missing.
-    #[error(
-        "psf.size is {size} (expected {MIN_PSF} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {MIN_PSF}"
-    )]
+    #[error("psf.size is {size} (expected {MIN_PSF} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px{}", tried(self.hint()))]
     PsfSize {
         /// Pixels a side that are used.
         size: usize,
     },
     /// Most galaxies could not be measured.
-    #[error(
-        "{count} of {of} galaxies are flagged (most frequent reason: {flag}). Try: {}",
-        advice(*flag)
-    )]
+    #[error("{count} of {of} galaxies are flagged (most frequent reason: {flag}){}", tried(self.hint()))]
     Flagged { flag: Flag, count: usize, of: usize },
 }
 
@@ -638,6 +548,54 @@ impl Warning {
         (2 * count > of).then_some(Warning::Flagged { flag, count, of })
     }
 
+    hints! {
+        Self::Epoch { warning, .. } => return warning.hint(),
+        Self::Sky { subtracted: false, .. } | Self::Gradient { subtracted: false, .. } => "subtract the sky",
+        Self::GivenNoise { given, measured } => noise_advice(*given, *measured).1,
+        Self::PsfNoise { effect: None, .. } => "a model of the PSF, fitted to all stars",
+        Self::PsfNoise { .. } => "average several stars, or fit a model",
+        Self::OffCentre { .. } | Self::PositionScatter { .. } => "cut the stamps around the galaxies",
+        Self::MaskedGalaxies { .. } => "--mask-bits with the bits of bad pixels (without DETECTED), or a mask that is no segmentation map",
+        Self::Negative { .. } => "check the sign of the image",
+        Self::Depths { .. } => "give the noise of each stamp (gather --variance or --weight-map, `noise` in Python), or put stamps of one depth into an image",
+        Self::LongCorrelation { .. } => "use images before resampling or smoothing",
+        Self::Banding { rows, .. } => &format!("subtract from each {} of the exposure its median, without the galaxies", if *rows { "row" } else { "column" }),
+        Self::SkyLevels { .. } | Self::SkySlopes { .. } => "--submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  noise.sky = \"stamp\"",
+        Self::Idle { .. } => "other values of deconvolution.step and deconvolution.lambda",
+        Self::NoResponse { .. } => "check that the PSF has the pixel scale of the galaxies, and that there are galaxies",
+        Self::Copies { .. } => "remove repeated galaxies",
+        Self::Blank { .. } => "check the file and its extension",
+        Self::Brightness { .. } => "divide the image and its noise by a constant",
+        Self::CorrelatedNoise { .. } => "set noise.source to \"image\" and noise.correlation above 0",
+        Self::EpochNoise { .. } => "exposures that were not resampled",
+        Self::EpochNoNoise => "check the file, its extension and its mask",
+        Self::EpochOffset { .. } => "check sign, order and axes of the dithers or positions, and that the PSF is centred on its stamp",
+        Self::ScatteredPsfs { .. } => "PSFs in the middle of their stamps, or offsets of the galaxies less those of their PSFs",
+        Self::EpochFlux { .. } => "scale image, noise and gain to one zero point",
+        Self::EpochWithoutGalaxies { .. } => "check that image, WCS and dither belong together",
+        Self::EpochGalaxies { .. } => "check that files and rows of the epochs belong together. Bands of galaxies with various colours may have this warning, too",
+        Self::EpochCopies { .. } => "remove one of the epochs",
+        Self::NoNoise => "cut off borders of missing pixels (with stamp.size of the smaller stamps in a settings file), and mask neighbours but not the sky and the galaxies",
+        Self::PsfBackground { .. } => "subtract the background, or use a larger PSF stamp if the PSF fills it",
+        Self::PsfDefect { .. } => "a model of the PSF, or other stars",
+        Self::PsfGradient { .. } => "subtract the background",
+        Self::Defects { .. } => "replace such pixels by NaN, and cut stamps before a deblender fills them",
+        Self::Empty { .. } => "check that the positions are those of galaxies on this image",
+        Self::Saturated { .. } | Self::FlatTops { .. } => "replace saturated pixels by NaN",
+        Self::PeakNormalised { .. } => "stamps in one unit",
+        Self::Clipped { .. } => "images whose negative pixels are kept",
+        Self::PsfTruncated { .. } => "a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",
+        Self::PsfNarrow { .. } => "a PSF on finer pixels, with gather --psf-oversampling (psf_oversampling in Python); or check that the file is a PSF with the pixel scale of the galaxies",
+        Self::PsfBroad { .. } => "check the sampling of the PSF, and that the objects are not stars",
+        Self::PixelScale { .. } => "resample the PSF to the pixels of the galaxies, or correct its header",
+        Self::OtherImage { .. } => "put the files back, or correct the header",
+        Self::PixelFrame(..) => "transform e1 and e2 with the WCS, or compare them with shears along the pixel axes",
+        Self::PsfFrame { .. } => "draw the PSF with the WCS of the galaxies, or correct its header",
+        Self::SharedPsf { .. } => "a PSF on the pixels of each stamp",
+        Self::PsfSize { .. } => &format!("psf.size = {MIN_PSF}"),
+        Self::Flagged { flag, .. } => advice(*flag),
+    }
+
     /// The warning itself, if it is about an epoch.
     pub fn inner(&self) -> &Warning {
         match self {
@@ -669,7 +627,7 @@ fn sky(level: f64, error: f64, noise: f64, share: f64, subtracted: bool) -> Stri
             "(found {level} ± {error}{in_noise}; expected 0). It was subtracted from all stamps"
         ),
         false => format!(
-            "(found {level} ± {error} in their corners{in_noise}; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
+            "(found {level} ± {error} in their corners{in_noise}; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears",
             100.0 * share
         ),
     }
@@ -683,26 +641,33 @@ fn gradient(slope: [f64; 2], error: f64, noise: f64, subtracted: bool) -> String
     let ([x, y], error) = (slope.map(|slope| slope / unit), error / unit);
     let end = match subtracted {
         true => ". It was subtracted from all stamps",
-        false => ", which biases shears. Try: subtract the sky",
+        false => ", which biases shears",
     };
     format!(
         "(found {x:+.4} along x and {y:+.4} along y, ± {error:.4}, in units of {name} per pixel; expected 0){end}"
     )
 }
 
-/// What may be wrong with a given noise level: a map of standard deviations, or of squared variances, in place of variances.
-fn noise_advice(given: f64, measured: f64) -> &'static str {
+/// What may be wrong with a given noise level, and what to try: a map of standard deviations, or of squared variances, in place of
+/// variances.
+fn noise_advice(given: f64, measured: f64) -> (&'static str, &'static str) {
     // Near one, a number and its square are alike.
     let is = |level: f64| {
         (measured / level - 1.0).abs() < POWER_OF_NOISE
             && (level / given).ln().abs() > POWER_OF_NOISE
     };
     if is(given * given) {
-        "It is the square root of it: a map of variances may hold standard deviations. Try: square the map"
+        (
+            ". It is the square root of it: a map of variances may hold standard deviations",
+            "square the map",
+        )
     } else if is(given.sqrt()) {
-        "It is the square of it: variances may be squared twice, or given as standard deviations. Try: take the square root"
+        (
+            ". It is the square of it: variances may be squared twice, or given as standard deviations",
+            "take the square root",
+        )
     } else {
-        "Try: leave out the noise, so that it is measured"
+        ("", "leave out the noise, so that it is measured")
     }
 }
 

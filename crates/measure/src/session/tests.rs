@@ -380,6 +380,20 @@ fn noise_taken_as_white_is_tested_up_to_two_pixels() {
 }
 
 #[test]
+fn hints_of_warnings_are_known_apart_from_their_texts() {
+    let warning = Warning::Epoch {
+        epoch: 2,
+        warning: Box::new(Warning::EpochNoNoise),
+    };
+    let hint = Some("check the file, its extension and its mask".to_owned());
+    assert_eq!(warning.hint(), hint);
+    let text = warning.to_string();
+    assert!(text.starts_with("epoch 2: cannot measure the noise"));
+    assert!(text.ends_with("left out. Try: check the file, its extension and its mask"));
+    assert_eq!(MeasureError::Data(warning).hint(), hint);
+}
+
+#[test]
 fn errors_of_reading_are_not_taken_for_small_stamps() {
     let registry = Registry::embedded().unwrap();
     let named = registry.get("48/linear/star").unwrap().configuration;
