@@ -1,6 +1,7 @@
 //! Images of a folder, and the share of one process.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::str::FromStr;
 
 use shearq_files::FileError;
@@ -24,9 +25,8 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
         let images = files.of_set(set);
         if images.is_empty() {
             let path = data.galaxies(set, 1);
-            let advice = advice(data);
-            let message = format!("there is no image of set {set}; expected this file{advice}");
-            return Err(FileError::new(path, message));
+            let message = format!("there is no image of set {set}; expected this file");
+            return Err(no_images(data, &path, message));
         }
         let id = |(image, _)| ImageId { set, image };
         found.extend(images.into_iter().map(id));
@@ -34,11 +34,10 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     if found.is_empty() {
         let pattern = &data.layout().galaxies;
         let (example, found) = (fill(pattern, 1, 1), sample(data.root())?);
-        let advice = advice(data);
         let message = format!(
-            "there are no galaxy images here (found {found}, expected {pattern}, as in {example}){advice}"
+            "there are no galaxy images here (found {found}, expected {pattern}, as in {example})"
         );
-        return Err(FileError::new(data.root(), message));
+        return Err(no_images(data, data.root(), message));
     }
     Ok(found)
 }
@@ -77,15 +76,16 @@ fn check_subfields(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
                 0 => "expected epoch 0, as all subfields of the branch have".to_owned(),
                 last => format!("expected epochs 0 to {last}, as there is {witness}"),
             };
-            let advice = match there.is_empty() {
-                true => ". Try: restore the image, or --sets with the subfields that have images",
-                false => ". Try: restore the image",
-            };
             let message = format!(
-                "there is no such epoch (found {} of subfield {set}, {expected}){advice}",
+                "there is no such epoch (found {} of subfield {set}, {expected})",
                 listed(&there)
             );
-            return Err(FileError::new(data.galaxies(set, epoch), message));
+            return Err(FileError::new(data.galaxies(set, epoch), message).hint(
+                match there.is_empty() {
+                    true => "restore the image, or --sets with the subfields that have images",
+                    false => "restore the image",
+                },
+            ));
         }
     }
     Ok(())
@@ -124,13 +124,11 @@ fn listed(numbers: &[u32]) -> String {
     }
 }
 
-fn advice(data: &DataFolder) -> String {
+fn no_images(data: &DataFolder, path: &Path, message: String) -> FileError {
     match data.folder_above() {
-        Some(folder) => format!(
-            ". This is the folder of one set. Try: --data {}",
-            folder.display()
-        ),
-        None => String::new(),
+        Some(folder) => FileError::new(path, message + ". This is the folder of one set")
+            .hint(format!("--data {}", folder.display())),
+        None => FileError::new(path, message),
     }
 }
 

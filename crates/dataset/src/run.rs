@@ -142,14 +142,16 @@ impl Run {
         }
         // The most frequent mistake is to name the data in place of the results.
         let images = DataFolder::open(folder).and_then(|data| data.images(&[]));
-        let message = match images {
-            Ok(images) if !images.sets().is_empty() => format!(
-                "this is a data folder: it contains galaxy images and no {RUN_FILE}; expected {EXPECTED}. Try: shearq measure --data {} --out OUT --submission 48/linear/star",
+        Err(match images {
+            Ok(images) if !images.sets().is_empty() => FileError::new(folder, format!(
+                "this is a data folder: it contains galaxy images and no {RUN_FILE}; expected {EXPECTED}"
+            ))
+            .hint(format!(
+                "shearq measure --data {} --out OUT --submission 48/linear/star",
                 folder.display()
-            ),
-            _ => format!("there is no {RUN_FILE}; expected {EXPECTED}"),
-        };
-        Err(FileError::new(folder, message))
+            )),
+            _ => FileError::new(folder, format!("there is no {RUN_FILE}; expected {EXPECTED}")),
+        })
     }
 
     /// Claims a folder for the catalogues of this run.
@@ -182,19 +184,19 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     let Some(run) = Run::read(folder)? else {
         return Ok(data);
     };
-    let advice = match &run.source {
+    let message = format!(
+        "this folder contains catalogues ({RUN_FILE}) and no galaxy images; expected the data folder that they were measured from"
+    );
+    Err(match &run.source {
         Source::Folder { path, .. } => {
             let data = shortened(folder.join(path));
-            format!(". Try: --data {}", data.display())
+            FileError::new(folder, message).hint(format!("--data {}", data.display()))
         }
-        Source::Simulated(_) => {
-            "; they were simulated in memory, and `shearq simulate` writes images".into()
-        }
-    };
-    let message = format!(
-        "this folder contains catalogues ({RUN_FILE}) and no galaxy images; expected the data folder that they were measured from{advice}"
-    );
-    Err(FileError::new(folder, message))
+        Source::Simulated(_) => FileError::new(
+            folder,
+            message + "; they were simulated in memory, and `shearq simulate` writes images",
+        ),
+    })
 }
 
 /// Name of the record in a simulated data folder.

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_quantities::{hints, tried};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign, sign_by_modes};
 
 use crate::grid;
@@ -30,16 +31,21 @@ pub struct Reading {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SignFault {
-    #[error("the file states `{SIGN_KEY}: {}`, but `{}` was specified. Try: omit --truth-sign", word(*stated), word(*specified))]
+    #[error("the file states `{SIGN_KEY}: {}`, but `{}` was specified{}", word(*stated), word(*specified), tried(self.hint()))]
     Contradicted {
         stated: TruthSign,
         specified: TruthSign,
     },
     // There is no default, because a wrong sign turns a bias of 0 into one of -2.
-    #[error(
-        "cannot determine the sign of g2 in the truth (found no statement, no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: --truth-sign standard (g2 > 0 along x = y), --truth-sign challenge (the other sign), or a line `# {SIGN_KEY}: standard` in the file"
-    )]
+    #[error("cannot determine the sign of g2 in the truth (found no statement, no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them){}", tried(self.hint()))]
     Unclear,
+}
+
+impl SignFault {
+    hints! {
+        Self::Contradicted { .. } => "omit --truth-sign",
+        Self::Unclear => &format!("--truth-sign standard (g2 > 0 along x = y), --truth-sign challenge (the other sign), or a line `# {SIGN_KEY}: standard` in the file"),
+    }
 }
 
 /// How the sign of g2 in a truth was determined.

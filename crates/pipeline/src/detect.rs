@@ -359,7 +359,11 @@ impl DetectionTask<'_> {
             other => other,
         })?;
         if found.is_empty() {
-            return Err(exposure.origin.fault("no galaxy was detected (expected some). Try: a lower --threshold, or check --noise").into());
+            return Err(exposure
+                .origin
+                .fault("no galaxy was detected (expected some)")
+                .hint("a lower --threshold, or check --noise")
+                .into());
         }
         let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
         // Not before: a folder that a failed detection has claimed would refuse its remedies.
@@ -428,7 +432,7 @@ impl DetectionTask<'_> {
         let detector = Detector::new(star.view(), noise, jacobian, &self.settings);
         detector.map_err(|error| match error {
             MeasureError::Noise(_) => exposure.origin.fault(&error.to_string()),
-            _ => FileError::new(&self.psf.paths[0], error),
+            _ => FileError::with_hint(&self.psf.paths[0], &error, error.hint()),
         })
     }
 
@@ -485,7 +489,7 @@ impl DetectionTask<'_> {
             let mut pixels: Vec<f32> = exposure.rows(rows)?;
             if let Some((map, bits)) = &mut mask {
                 let values: Vec<f64> = map.rows(rows)?;
-                lose(&mut pixels, &values, *bits).map_err(|error| map.origin.fault(&error))?;
+                lose(&mut pixels, &values, *bits, &map.origin)?;
             }
             let lost = pixels.iter().filter(|pixel| !pixel.is_finite()).count();
             missing.fetch_add(lost, Ordering::Relaxed);
@@ -506,7 +510,8 @@ impl DetectionTask<'_> {
             (Some(Frame::Sky), None) => {
                 return Err(exposure
                     .origin
-                    .fault("there is no WCS (expected one with --frame sky). Try: --frame pixel"));
+                    .fault("there is no WCS (expected one with --frame sky)")
+                    .hint("--frame pixel"));
             }
             (Some(frame), _) => frame == Frame::Sky,
             (None, Some(matrix)) => !aligned(matrix),
@@ -585,7 +590,9 @@ fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<f32>, Pi
 }
 
 fn unmeasured(exposure: &Exposure<'_>) -> FileError {
-    exposure.origin.fault("the noise cannot be measured (expected an exposure with blank sky between the galaxies). Try: --noise SIGMA")
+    let message =
+        "the noise cannot be measured (expected an exposure with blank sky between the galaxies)";
+    exposure.origin.fault(message).hint("--noise SIGMA")
 }
 
 fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise, PipelineError> {

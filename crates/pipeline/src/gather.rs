@@ -116,8 +116,10 @@ fn gather_alone(
 ) -> Result<Vec<Option<Gathered>>, PipelineError> {
     // The table of stamps would replace the catalogue of galaxies, which another program wrote.
     if data.layout().great3.is_some() {
-        let message = "this folder is a branch of GREAT3, to which no image can be added (expected a folder of gathered images, or a new one). Try: another folder";
-        return Err(FileError::new(data.root(), message).into());
+        let message = "this folder is a branch of GREAT3, to which no image can be added (expected a folder of gathered images, or a new one)";
+        return Err(FileError::new(data.root(), message)
+            .hint("another folder")
+            .into());
     }
     let ids = (first.image..).map(|image| ImageId { image, ..first });
     for (_, id) in all.iter().zip(ids.clone()) {
@@ -171,19 +173,17 @@ fn leave_out_of_chips(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), F
                 .is_some_and(|found| !found.in_degrees())
         {
             let message = format!(
-                "x and y are pixels of one chip (found one table for {} chips, expected right ascension and declination, or a table for each). Try: --degrees",
+                "x and y are pixels of one chip (found one table for {} chips, expected right ascension and declination, or a table for each)",
                 same.len()
             );
-            return Err(FileError::new(table.path, message));
+            return Err(FileError::new(table.path, message).hint("--degrees"));
         }
         let on_none = (0..count).filter(|&row| !same.iter().any(|&chip| plans[chip].inside[row]));
         let on_none = on_none.count();
         if on_none == count {
-            let message = format!(
-                "all {count} positions are outside the {} chips. Try: check the positions and the WCS of the chips",
-                same.len()
-            );
-            return Err(FileError::new(table.path, message));
+            let message = format!("all {count} positions are outside the {} chips", same.len());
+            return Err(FileError::new(table.path, message)
+                .hint("check the positions and the WCS of the chips"));
         }
         if on_none > 0 {
             let message = format!(
@@ -398,10 +398,8 @@ fn check_psf(
                 let [psf, stamp] = [psf, stamp].map(|matrix| Wcs::of_jacobian(*matrix));
                 if let Some(warning) = Wcs::disagreements(&psf, &stamp).next() {
                     let row = row + 1;
-                    return Err(FileError::new(
-                        &psfs.first,
-                        format!("stamp {row}: {warning}"),
-                    ));
+                    let text = format!("stamp {row}: {warning}");
+                    return Err(FileError::with_hint(&psfs.first, &text, warning.hint()));
                 }
             }
         }
@@ -421,7 +419,7 @@ fn check_psf(
         _ => jacobians.is_some(),
     };
     match warnings.iter().find(refused) {
-        Some(warning) => Err(FileError::new(&psfs.first, warning)),
+        Some(warning) => Err(FileError::with_hint(&psfs.first, warning, warning.hint())),
         None => Ok(warnings),
     }
 }
@@ -432,7 +430,9 @@ fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>,
     both.join(&psfs.examination);
     let broad = |warning: &Warning| matches!(warning, Warning::PsfBroad { .. });
     match both.warnings().into_iter().find(broad) {
-        Some(warning) if warning.is_fatal() => Err(FileError::new(&psfs.first, warning)),
+        Some(warning) if warning.is_fatal() => {
+            Err(FileError::with_hint(&psfs.first, &warning, warning.hint()))
+        }
         found => Ok(found),
     }
 }

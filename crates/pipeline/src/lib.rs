@@ -54,3 +54,15 @@ pub enum PipelineError {
     #[error(transparent)]
     Threads(#[from] ThreadError),
 }
+
+impl PipelineError {
+    /// What can be tried about it.
+    pub fn hint(&self) -> Option<String> {
+        match self {
+            Self::File(error) => error.hint.clone(),
+            Self::Measure(error) => error.hint(),
+            Self::Fatal { warning, .. } => warning.hint(),
+            _ => None,
+        }
+    }
+}

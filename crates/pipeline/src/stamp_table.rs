@@ -78,17 +78,14 @@ impl StampTable {
         let (found, expected) = (columns.height(), mosaic.galaxies);
         // The image and its table are two files, and one of them may be of an earlier `gather`.
         if found != expected {
-            let message = format!(
-                "{found} rows; expected {expected}, one per stamp of the image. Try: gather it again"
-            );
-            return Err(FileError::new(path, message));
+            let message = format!("{found} rows; expected {expected}, one per stamp of the image");
+            return Err(FileError::new(path, message).hint("gather it again"));
         }
         let metadata = parquet::metadata(path)?;
         let wrong = |key: &str| {
             let found = metadata.get(key).map_or("nothing", String::as_str);
-            let message =
-                format!("the metadata `{key}` are wrong (found {found}). Try: gather again");
-            FileError::new(path, message)
+            let message = format!("the metadata `{key}` are wrong (found {found})");
+            FileError::new(path, message).hint("gather again")
         };
         let value = |key: &str| metadata.get(key).map(String::as_str);
         let head = Head {

@@ -35,11 +35,11 @@ impl<'a> Exposure<'a> {
             }
         };
         if planes != 1 {
-            let message = format!(
-                "the image has {planes} planes; expected an exposure, which has one. Try: {} plane=1",
-                files.content.option()
-            );
-            return Err(origin.fault(&message));
+            let message =
+                format!("the image has {planes} planes; expected an exposure, which has one");
+            return Err(origin
+                .fault(&message)
+                .hint(format!("{} plane=1", files.content.option())));
         }
         Ok(Exposure {
             images,
@@ -132,12 +132,11 @@ fn check_one(files: &Files<'_>) -> Result<Option<String>, FileError> {
     let names: Vec<String> = meant.iter().map(|head| head.shown(&all)).collect();
     if selection.names_images() || files.content != Content::Sky {
         let message = format!(
-            "{count} images may be the {} (found {}; expected one). Try: {option} {}",
+            "{count} images may be the {} (found {}; expected one)",
             files.content.noun(),
-            names_of(&names),
-            names[0]
+            names_of(&names)
         );
-        return Err(FileError::new(&path, message));
+        return Err(FileError::new(&path, message).hint(format!("{option} {}", names[0])));
     }
     let called = match first.name.as_str() {
         "" => String::new(),

@@ -208,11 +208,15 @@ impl<'a> Images<'a> {
                 continue;
             }
             if !self.selection.names_images() && self.files.content.is_not(&head.name) {
-                return Err(origin.fault(&format!(
-                    "the image is called {}; expected an image of the sky or a PSF. Try: choose images by name with {}",
-                    head.name,
-                    self.files.content.option()
-                )));
+                return Err(origin
+                    .fault(&format!(
+                        "the image is called {}; expected an image of the sky or a PSF",
+                        head.name
+                    ))
+                    .hint(format!(
+                        "choose images by name with {}",
+                        self.files.content.option()
+                    )));
             }
             self.found = true;
             match self.selection.planes {
@@ -224,9 +228,10 @@ impl<'a> Images<'a> {
                     let planes = image.planes();
                     self.small_cubes += usize::from((2..=MAX_BANDS).contains(&planes));
                     if planes > 1 && (self.small_cubes > 1 || has_bands(image)) {
-                        return Err(origin.fault(&format!(
-                            "the image has {planes} planes, which may be one galaxy in {planes} bands (expected a galaxy per plane). Try: --extension plane=1 for one band, or --extension plane=all if each plane is a galaxy"
-                        )));
+                        let message = format!(
+                            "the image has {planes} planes, which may be one galaxy in {planes} bands (expected a galaxy per plane)"
+                        );
+                        return Err(origin.fault(&message).hint("--extension plane=1 for one band, or --extension plane=all if each plane is a galaxy"));
                     }
                 }
                 Planes::Unstated | Planes::Each => {}

@@ -25,12 +25,13 @@ pub(crate) fn another(
 // infinity. A star of 65,000 electrons in a sky of one has 6.5·10⁴.
 const MIN_BAD_RATIO: f64 = 1e5;
 
-// Maps may have any value where the pixel is missing already.
+// Maps may have any value where the pixel is missing already. `fault` names the stamp.
 pub(super) fn variance(
     pixels: &mut [f32],
     values: &mut [f64],
     content: Content,
-) -> Result<(), String> {
+    fault: impl Fn(&str) -> FileError,
+) -> Result<(), FileError> {
     let inverse = |stated: f64| match content {
         Content::Weight => 1.0 / stated,
         _ => stated,
@@ -48,19 +49,14 @@ pub(super) fn variance(
             *pixel = f32::NAN;
         }
         if pixel.is_finite() && (value.is_nan() || *value <= 0.0) {
-            let what = match content {
-                Content::Weight => {
-                    "the weight is {stated}; expected a positive number, or 0 for a bad pixel"
-                }
-                _ => {
-                    "the variance is {stated}; expected a positive number, or infinity for a bad pixel. Try: infinity in place of it if such pixels are bad, or --mask with these pixels"
-                }
-            };
             let shown = match stated.is_nan() {
                 true => "NaN or infinite".to_owned(),
                 false => stated.to_string(),
             };
-            return Err(what.replace("{stated}", &shown));
+            return Err(match content {
+                Content::Weight => fault(&format!("the weight is {shown}; expected a positive number, or 0 for a bad pixel")),
+                _ => fault(&format!("the variance is {shown}; expected a positive number, or infinity for a bad pixel")).hint("infinity in place of it if such pixels are bad, or --mask with these pixels"),
+            });
         }
         if !pixel.is_finite() {
             *value = f64::NAN;
@@ -101,21 +97,27 @@ fn is_outside(at: usize, side: usize) -> bool {
 }
 
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits. Returns their number.
-pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<usize, String> {
+pub(crate) fn lose(
+    pixels: &mut [f32],
+    mask: &[f64],
+    bits: Option<u64>,
+    origin: &Origin<'_>,
+) -> Result<usize, FileError> {
     let mut lost = 0;
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
         let bad = match bits {
             Some(bits) if mask.is_finite() => {
                 if mask.fract() != 0.0 {
-                    return Err(format!(
+                    return Err(origin.fault(&format!(
                         "the mask has the value {mask}; expected whole numbers, of which --mask-bits takes bits"
-                    ));
+                    )));
                 }
                 // Masks are read in double precision, which has no low bits beside such a one.
                 if mask.abs() >= MAX_EXACT_INTEGER {
-                    return Err(format!(
-                        "the mask has the value {mask:e}, but --mask-bits reads bits 0 to 52 only (expected values below 2^53). Try: a mask of 32-bit integers with the bits that are needed, as `mask & 0x7fffffff`"
-                    ));
+                    let message = format!(
+                        "the mask has the value {mask:e}, but --mask-bits reads bits 0 to 52 only (expected values below 2^53)"
+                    );
+                    return Err(origin.fault(&message).hint("a mask of 32-bit integers with the bits that are needed, as `mask & 0x7fffffff`"));
                 }
                 // Negative numbers are in two's complement, as in the file.
                 (*mask as i64) as u64 & bits != 0
@@ -132,11 +134,22 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     #[test]
     fn masks_whose_low_bits_are_lost_are_refused() {
-        let of = |mask: i64, bits| lose(&mut [1.0], &[mask as f64], bits);
+        let origin = Origin {
+            file: Path::new("mask.fits"),
+            image: 1,
+            plane: 1,
+            position: None,
+        };
+        let of = |mask: i64, bits| {
+            let lost = lose(&mut [1.0], &[mask as f64], bits, &origin);
+            lost.map_err(|error| error.text())
+        };
         for mask in [1 << 53, (1 << 54) + 1, (1 << 60) + 1, i64::MIN + 1] {
             let error = of(mask, Some(1)).unwrap_err();
             assert!(error.contains("expected values below 2^53"), "{error}");
@@ -164,7 +177,8 @@ mod tests {
             } else {
                 good * 6e4
             };
-            variance(&mut pixels, &mut values, content).unwrap();
+            let fault = |what: &str| FileError::new("map.fits", what);
+            variance(&mut pixels, &mut values, content, fault).unwrap();
             assert!(pixels[4].is_nan() && values[4].is_nan(), "{bad}");
             let missing = pixels.iter().filter(|pixel| pixel.is_nan()).count();
             assert_eq!((missing, values[0]), (1, 2.0), "{bad}");

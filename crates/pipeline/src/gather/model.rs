@@ -49,12 +49,13 @@ impl PsfModel {
         };
         let Some(table) = table else {
             let message = format!(
-                "found {} models of PSFEx for {} exposures; expected one, or one for each. Try: {}[2]",
+                "found {} models of PSFEx for {} exposures; expected one, or one for each",
                 of_psfex.len(),
-                chip.of,
-                place.path.display()
+                chip.of
             );
-            return Err(FileError::new(&place.path, message));
+            return Err(
+                FileError::new(&place.path, message).hint(format!("{}[2]", place.path.display()))
+            );
         };
         let model = PsfexModel::read(&place.path, table.number)?;
         Ok(Some(PsfModel::Psfex(Box::new(model))))
@@ -282,13 +283,13 @@ fn draw_by_python(
 ) -> Result<(), FileError> {
     let python = std::env::var_os(PYTHON).unwrap_or_else(|| OsString::from("python3"));
     let fault = |what: String| {
-        FileError::new(
-            path,
-            format!(
-                "{what}. A model of Piff is drawn by the Python package, `{} -m shearq._drawn_psfs`. Try: pip install shearq piff; {PYTHON}=PYTHON names an interpreter",
-                python.display()
-            ),
-        )
+        let message = format!(
+            "{what}. A model of Piff is drawn by the Python package, `{} -m shearq._drawn_psfs`",
+            python.display()
+        );
+        FileError::new(path, message).hint(format!(
+            "pip install shearq piff; {PYTHON}=PYTHON names an interpreter"
+        ))
     };
     let child = Command::new(&python)
         .args(["-m", "shearq._drawn_psfs"])

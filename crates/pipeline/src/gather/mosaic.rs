@@ -96,15 +96,13 @@ impl StampWriter {
                 match content {
                     Content::Mask => {
                         let bits = gathering.masks.and_then(|masks| masks.bits);
-                        let lost = lose(&mut pixels, &values, bits);
-                        self.masked += lost.map_err(|fault| place.fault(&fault))?;
+                        self.masked += lose(&mut pixels, &values, bits, &place)?;
                     }
                     _ => variances = Some((place, content, values)),
                 }
             }
             if let Some((place, content, mut values)) = variances {
-                let read = variance(&mut pixels, &mut values, content);
-                read.map_err(|fault| place.fault(&fault))?;
+                variance(&mut pixels, &mut values, content, |what| place.fault(what))?;
                 let values = central(values, sides, side);
                 self.levels
                     .get_or_insert_default()
@@ -141,14 +139,13 @@ impl StampWriter {
             let mut pixels = exposure.square::<f32>((x, y), side)?;
             if let Some(mask) = &mut masks {
                 let square = mask.square::<f64>((x, y), side)?;
-                let lost = lose(&mut pixels, &square, bits);
-                self.masked += lost.map_err(|fault| mask.origin.fault(&fault))?;
+                self.masked += lose(&mut pixels, &square, bits, &mask.origin)?;
             }
             if let Some(map) = &mut maps {
                 let mut values = map.square::<f64>((x, y), side)?;
-                variance(&mut pixels, &mut values, map.content()).map_err(|fault| {
+                variance(&mut pixels, &mut values, map.content(), |what| {
                     map.origin
-                        .fault(&format!("stamp at ({x:.1}, {y:.1}): {fault}"))
+                        .fault(&format!("stamp at ({x:.1}, {y:.1}): {what}"))
                 })?;
                 self.levels
                     .get_or_insert_default()
@@ -172,10 +169,11 @@ impl StampWriter {
             Some(_) => "check --mask-bits",
             None => "invert the mask if it is one for good pixels, or choose bits with --mask-bits",
         };
-        Some(format!(
-            "warning: {}: the mask has bad pixels on {share:.1} % of the stamps (not zero; expected few). Try: {remedy}",
-            masks.files.paths[0].display()
-        ))
+        let message = format!(
+            "the mask has bad pixels on {share:.1} % of the stamps (not zero; expected few)"
+        );
+        let warning = FileError::new(&masks.files.paths[0], message).hint(remedy);
+        Some(format!("warning: {warning}"))
     }
 
     fn add(&mut self, origin: &Origin<'_>, pixels: &[f32]) -> Result<(), FileError> {
@@ -282,8 +280,7 @@ impl Rows {
 }
 
 pub(super) fn already(path: PathBuf) -> FileError {
-    let message = "the file is there already. Try: another number with --set and --image";
-    FileError::new(path, message)
+    FileError::new(path, "the file is there already").hint("another number with --set and --image")
 }
 
 /// An error if the file was not `named`, because there is one at `path`.

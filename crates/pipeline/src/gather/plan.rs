@@ -34,6 +34,8 @@ const SQUARE: &str =
     "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
 
+const PIXEL_AXES: &str = "--frame pixel, for ellipticities along the pixel axes";
+
 pub(super) struct Plan {
     /// Where they are cut out of an exposure.
     pub(super) positions: Option<Positions>,
@@ -104,29 +106,28 @@ impl Plan {
                 exposure: files, ..
             } => files,
         };
-        let fault = |message: String| Err(FileError::new(&files.paths[0], message));
+        let fault = |message: &str| FileError::new(&files.paths[0], message);
         if frame == Some(Frame::Pixel) {
             return Ok(None);
         }
         if let Some(error) = &self.stack.fault_of_cube {
-            return fault(format!(
-                "{error}. Try: --positions with x and y of each stamp, in FITS pixels of the exposure, or --frame pixel, for ellipticities along the pixel axes"
-            ));
+            return Err(fault(error).hint("--positions with x and y of each stamp, in FITS pixels of the exposure, or --frame pixel, for ellipticities along the pixel axes"));
         }
         let all: Option<Vec<Matrix2>> = self.pixels().into_iter().collect();
         let Some(all) = all else {
             if let Some(error) = self.stack.wcs.fault() {
-                return fault(format!(
-                    "{error}. Try: --frame pixel, for ellipticities along the pixel axes"
-                ));
+                return Err(fault(&error).hint(PIXEL_AXES));
             }
             let expected =
                 "and the header has no WCS (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one)";
             return match (frame, gathering.frame) {
-                (Some(Frame::Sky), Some(_)) => fault(format!("--frame is sky, {expected}")),
-                (Some(Frame::Sky), None) => fault(format!(
-                    "the exposures have different pixels on the sky, {expected}. Try: a header with a WCS, or --frame pixel, for ellipticities along the pixel axes of each exposure"
-                )),
+                (Some(Frame::Sky), Some(_)) => Err(fault(&format!("--frame is sky, {expected}"))),
+                (Some(Frame::Sky), None) => Err(fault(&format!(
+                    "the exposures have different pixels on the sky, {expected}"
+                ))
+                .hint(format!(
+                    "a header with a WCS, or {PIXEL_AXES} of each exposure"
+                ))),
                 _ => Ok(None),
             };
         };
@@ -136,16 +137,16 @@ impl Plan {
             return Ok(None);
         }
         if let Some(kind) = self.stack.wcs.unread() {
-            return fault(format!(
-                "the WCS is {kind} (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one), so that the pixels on the sky are not known. Try: --frame pixel, for ellipticities along the pixel axes"
-            ));
+            let message = format!(
+                "the WCS is {kind} (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one), so that the pixels on the sky are not known"
+            );
+            return Err(fault(&message).hint(PIXEL_AXES));
         }
         for (row, jacobian) in all.iter().enumerate() {
             if let Err(error) = Jacobian::new(*jacobian) {
                 let row = row + 1;
-                return fault(format!(
-                    "the WCS has no inverse at stamp {row}: {error}. Try: --frame pixel, or correct the header"
-                ));
+                let message = format!("the WCS has no inverse at stamp {row}: {error}");
+                return Err(fault(&message).hint("--frame pixel, or correct the header"));
             }
         }
         Ok(Some(all))
@@ -204,10 +205,11 @@ impl Plan {
         let (stack, mut messages) = Stack::of(files, square)?;
         let side = stack.side;
         if stack.count == 1 && side >= LARGE_STAMP_PX {
-            messages.push(format!(
-                "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
-                files.paths[0].display()
-            ));
+            let message = format!(
+                "the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure"
+            );
+            let warning = FileError::new(&files.paths[0], message).hint(MOSAIC);
+            messages.push(format!("warning: {warning}"));
         }
         Ok(Plan {
             positions: None,
@@ -322,20 +324,19 @@ impl Stack {
         while let Some((origin, image)) = images.next()? {
             let (width, height) = (image.width(), image.height());
             if width.max(height) > MAX_STAMP || width != height && square.is_none() {
-                let advice = match files.content {
+                let fault = origin.fault(&format!(
+                    "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}"
+                ));
+                return Err(match files.content {
                     Content::Sky if width.max(height) < LARGE_STAMP_PX => {
-                        format!(". Try: {SQUARE}{MOSAIC}")
+                        fault.hint(format!("{SQUARE}{MOSAIC}"))
                     }
-                    Content::Sky => format!(". Try: {MOSAIC}"),
+                    Content::Sky => fault.hint(MOSAIC),
                     Content::Psf if width.max(height) <= MAX_STAMP => {
-                        ". Try: --square crop, which takes the central square".to_owned()
+                        fault.hint("--square crop, which takes the central square")
                     }
-                    _ => String::new(),
-                };
-                let message = format!(
-                    "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}{advice}"
-                );
-                return Err(origin.fault(&message));
+                    _ => fault,
+                });
             }
             let side = match (files.content, square) {
                 (Content::Sky, Some(Square::Pad)) => width.max(height),
@@ -356,10 +357,10 @@ impl Stack {
             let expected = *expected;
             if side != expected && files.content == Content::Psf {
                 let message = format!(
-                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}{}",
-                    psf_extension_advice(origin.file)
+                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}"
                 );
-                return Err(origin.fault(&message));
+                let hint = psf_extension_advice(origin.file);
+                return Err(origin.fault(&message).hint_if(hint));
             }
             sides = match sides {
                 [0, 0] => [side; 2],
@@ -368,8 +369,13 @@ impl Stack {
             let is_other = wcs.states_axes() != first_wcs.states_axes()
                 || Wcs::disagreements(&wcs, first_wcs).next().is_some();
             if differs.is_none() && is_other {
-                let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes. Try: one orientation per image (--image)";
-                differs = Some(format!("warning: {}", origin.fault(message)));
+                let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes";
+                differs = Some(format!(
+                    "warning: {}",
+                    origin
+                        .fault(message)
+                        .hint("one orientation per image (--image)")
+                ));
             }
             count += image.planes();
             if count > MAX_STAMPS {
@@ -398,26 +404,20 @@ impl Stack {
     }
 }
 
-/// What to try with a file of several images as PSFs; empty of a file of one. STPSF and WebbPSF write the PSF on fine pixels and on the
+/// What to try with a file of several images as PSFs; `None` of a file of one. STPSF and WebbPSF write the PSF on fine pixels and on the
 /// detector's, without and with distortion.
-pub(super) fn psf_extension_advice(path: &Path) -> String {
+pub(super) fn psf_extension_advice(path: &Path) -> Option<String> {
     const DETECTOR_PIXELS: &str = "DET_DIST";
     let heads = image_heads(&Place::of(path).path).unwrap_or_default();
     let named: Vec<&str> = heads.iter().map(|head| head.name.as_str()).collect();
     let chosen = named.iter().find(|name| **name == DETECTOR_PIXELS);
     let chosen = chosen.or(named.iter().find(|name| !name.is_empty()));
-    match chosen {
-        Some(name) if named.len() > 1 => format!(
-            ". Try: --psf-extension {name} for one of the images ({})",
-            names_of(
-                &heads
-                    .iter()
-                    .map(|head| head.shown(&heads))
-                    .collect::<Vec<_>>()
-            )
-        ),
-        _ => String::new(),
-    }
+    let name = chosen.filter(|_| named.len() > 1)?;
+    let shown: Vec<_> = heads.iter().map(|head| head.shown(&heads)).collect();
+    Some(format!(
+        "--psf-extension {name} for one of the images ({})",
+        names_of(&shown)
+    ))
 }
 
 // Astropy keeps the key when it writes other pixels, so that it is no error.

@@ -208,14 +208,14 @@ impl Positions {
                 .filter(&mask)
                 .map_err(|error| FileError::new(path, error))?;
         }
-        let (kind, hint) = match !self.degrees && 10 * left_out > count {
-            true => ("warning", ". Try: check --columns and --exposure"),
-            false => ("note", ""),
-        };
-        Ok(Some(format!(
-            "{kind}: {}: {left_out} of {count} positions are outside the exposure and left out{hint}",
-            path.display()
-        )))
+        let line = FileError::new(
+            path,
+            format!("{left_out} of {count} positions are outside the exposure and left out"),
+        );
+        Ok(Some(match !self.degrees && 10 * left_out > count {
+            true => format!("warning: {}", line.hint("check --columns and --exposure")),
+            false => format!("note: {line}"),
+        }))
     }
 
     /// Warnings about the positions on an exposure of this WCS and size.
@@ -252,21 +252,28 @@ impl Positions {
                     None => String::new(),
                 }
             );
-            let message = match (&self.sky, degrees) {
-                (Some([ra, dec]), _) if self.degrees => format!(
-                    "{what} (found ra {}, dec {} first, expected places on {}). Try: check the positions and the WCS of the exposure",
-                    ra[0],
-                    dec[0],
-                    exposure.display()
+            let (message, hint) = match (&self.sky, degrees) {
+                (Some([ra, dec]), _) if self.degrees => (
+                    format!(
+                        "{what} (found ra {}, dec {} first, expected places on {})",
+                        ra[0],
+                        dec[0],
+                        exposure.display()
+                    ),
+                    "check the positions and the WCS of the exposure",
                 ),
-                (_, true) => format!(
-                    "{what} {pixels}. Are these degrees (right ascension and declination)? Try: --degrees, which uses the WCS of the exposure"
+                (_, true) => (
+                    format!(
+                        "{what} {pixels}. Are these degrees (right ascension and declination)?"
+                    ),
+                    "--degrees, which uses the WCS of the exposure",
                 ),
-                (_, false) => format!(
-                    "{what} {pixels}. Are these positions of another image? Try: name the columns with --columns X,Y"
+                (_, false) => (
+                    format!("{what} {pixels}. Are these positions of another image?"),
+                    "name the columns with --columns X,Y",
                 ),
             };
-            return Err(FileError::new(path, message));
+            return Err(FileError::new(path, message).hint(hint));
         }
         self.check_sky(exposure, wcs, &inside)?;
         let mut doubts = Vec::new();
@@ -278,12 +285,13 @@ impl Positions {
         }
         if let Some((earlier, later)) = first {
             let (x, y) = self.all[later];
-            doubts.push(format!(
-                "warning: {}: {repeated} of {count} positions are within {SAME_GALAXY_PX} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each row counts as a galaxy. Try: remove duplicates",
-                path.display(),
+            let message = format!(
+                "{repeated} of {count} positions are within {SAME_GALAXY_PX} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each row counts as a galaxy",
                 later + 1,
                 earlier + 1
-            ));
+            );
+            let warning = FileError::new(path, message).hint("remove duplicates");
+            doubts.push(format!("warning: {warning}"));
         }
         Ok(doubts)
     }
@@ -311,13 +319,14 @@ impl Positions {
         };
         let ((x, y), exposure) = (self.all[row], exposure.display());
         let message = format!(
-            "row {}: x and y are {distance:.0} px from where the WCS of {exposure} has ra and dec (found ({x}, {y}) for ({}, {}), one of {} rows more than {OTHER_GALAXY_PX} px away; expected one place). Try: --degrees, which uses ra and dec, or --columns with x and y on this exposure",
+            "row {}: x and y are {distance:.0} px from where the WCS of {exposure} has ra and dec (found ({x}, {y}) for ({}, {}), one of {} rows more than {OTHER_GALAXY_PX} px away; expected one place)",
             row + 1,
             ra[row],
             dec[row],
             apart.len()
         );
-        Err(FileError::new(&self.place.path, message))
+        Err(FileError::new(&self.place.path, message)
+            .hint("--degrees, which uses ra and dec, or --columns with x and y on this exposure"))
     }
 
     // A galaxy that is measured twice counts twice in the mean, as if its noise were independent.
@@ -360,9 +369,10 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
         (Some(named), None) => &named.names,
         (found, _) => {
             let found = found.map_or("no names of columns", |_| "several tables");
-            return Err(fault(format!(
-                "found {found}; expected one table with names. Try: --table with a name or a number"
-            )));
+            return Err(
+                fault(format!("found {found}; expected one table with names"))
+                    .hint("--table with a name or a number"),
+            );
         }
     };
     let id = match table.id {
@@ -380,9 +390,10 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
         .collect();
     if id.is_none() && places.is_empty() && table.carry.is_empty() {
         return Err(fault(format!(
-            "no column identifies the stamps (found {}; expected id, x and y, or ra and dec). Try: --id or --carry with a name",
+            "no column identifies the stamps (found {}; expected id, x and y, or ra and dec)",
             names_of(names)
-        )));
+        ))
+        .hint("--id or --carry with a name"));
     }
     let reals = places.iter().map(|(_, column)| column.as_str()).collect();
     let (wanted, texts) = selection(&place, reals, id.as_ref(), table.carry)?;
@@ -427,12 +438,13 @@ fn check_degrees(path: &Path, ra: &[f64], dec: &[f64]) -> Result<(), FileError> 
         None => Ok(()),
         Some(row) => {
             let message = format!(
-                "row {}: ra and dec are ({}, {}); expected degrees, −180 to 360 and −90 to 90. Try: correct the table, or rename columns of other quantities",
+                "row {}: ra and dec are ({}, {}); expected degrees, −180 to 360 and −90 to 90",
                 row + 1,
                 ra[row],
                 dec[row]
             );
-            Err(FileError::new(path, message))
+            Err(FileError::new(path, message)
+                .hint("correct the table, or rename columns of other quantities"))
         }
     }
 }
@@ -446,9 +458,9 @@ fn selection<'n>(
 ) -> Result<(Vec<&'n str>, Vec<&'n str>), FileError> {
     if let Some(name) = carry.iter().find(|name| is_taken(name)) {
         let message = format!(
-            "the column `{name}` cannot be carried, because catalogues have one of this name. Try: rename it in the table"
+            "the column `{name}` cannot be carried, because catalogues have one of this name"
         );
-        return Err(FileError::new(&place.path, message));
+        return Err(FileError::new(&place.path, message).hint("rename it in the table"));
     }
     if let Some(name) = carry
         .iter()
@@ -505,10 +517,8 @@ fn no_sky<T>(path: &Path, exposure: &Path, wcs: &Wcs) -> Result<T, FileError> {
             exposure.display()
         ),
     };
-    let message = format!(
-        "the positions are right ascensions and declinations; {found}. Try: columns in pixels, --columns X,Y"
-    );
-    Err(FileError::new(path, message))
+    let message = format!("the positions are right ascensions and declinations; {found}");
+    Err(FileError::new(path, message).hint("columns in pixels, --columns X,Y"))
 }
 
 fn on_exposure(
@@ -554,11 +564,12 @@ fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 
     Err(FileError::new(
         &place.path,
         format!(
-            "the columns have no names (found the first row `{}`, expected names such as `{}`). Try: --columns with the numbers of two columns, as in `1,2`",
+            "the columns have no names (found the first row `{}`, expected names such as `{}`)",
             names_of(&columns.unnamed),
             names.join(",")
         ),
-    ))
+    )
+    .hint("--columns with the numbers of two columns, as in `1,2`"))
 }
 
 /// The columns with known names, or the only two columns: of pixels unless they are `degrees`, or else of the sky. Sets the table
@@ -599,11 +610,11 @@ fn known(
                 .filter_map(|(named, _)| Some(named.table.as_ref()?.shown()))
                 .collect();
             let message = format!(
-                "{} tables have positions (found {}, expected one). Try: --table with a number",
+                "{} tables have positions (found {}, expected one)",
                 several.len(),
                 names_of(&tables)
             );
-            return Err(FileError::new(&place.path, message));
+            return Err(FileError::new(&place.path, message).hint("--table with a number"));
         }
     }
     let certain: Vec<&String> = columns
@@ -642,13 +653,14 @@ fn known(
     Err(FileError::new(
         &place.path,
         format!(
-            "cannot determine the columns of the positions (found {found}; expected {}). Try: --columns {example}",
+            "cannot determine the columns of the positions (found {found}; expected {})",
             match degrees {
                 true => "ra and dec, ALPHA_J2000 and DELTA_J2000, or two columns",
                 false => "x and y, X_IMAGE and Y_IMAGE, ra and dec, or two columns without names",
             }
         ),
-    ))
+    )
+    .hint(format!("--columns {example}")))
 }
 
 /// The first of the `known` pairs of names that a table has.
@@ -772,11 +784,8 @@ fn read_all(place: &Place, wanted: &[&str], texts: &[&str]) -> Result<DataFrame,
 /// Identities as 64-bit integers or texts, each of one galaxy.
 fn identities(path: &Path, column: Column) -> Result<Column, FileError> {
     let fault = |row: usize, what: String| {
-        let message = format!(
-            "row {}: {what}; expected one id per galaxy. Try: --id with another column, or remove duplicates",
-            row + 1
-        );
-        FileError::new(path, message)
+        let message = format!("row {}: {what}; expected one id per galaxy", row + 1);
+        FileError::new(path, message).hint("--id with another column, or remove duplicates")
     };
     let column = match column.dtype() {
         // Of text tables, integers beyond 2⁵³ are texts.

@@ -50,9 +50,9 @@ pub(super) fn gather_psfs(
     {
         if oversampling > 1 {
             let message = format!(
-                "a model states its own sampling (found an oversampling of {oversampling}, expected none). Try: without --psf-oversampling"
+                "a model states its own sampling (found an oversampling of {oversampling}, expected none)"
             );
-            return Err(FileError::new(path, message));
+            return Err(FileError::new(path, message).hint("without --psf-oversampling"));
         }
         let to = data.psf_star(id.set, id.image);
         return of_model(path, &model, &to, plan, places);
@@ -125,14 +125,15 @@ pub(super) fn gather_psfs(
         let light = writer.add(&pixels)?;
         if count == 1 && writer.dark > 0 {
             let missing = pixels.iter().filter(|value| !value.is_finite()).count();
-            let message = match missing {
-                0 => format!("the pixels of the PSF add up to {light}; expected a positive sum"),
-                _ => format!(
-                    "{missing} of {} pixels of the PSF are missing (NaN or infinite; expected none). Try: a model of the PSF, or values of the neighbours in their place",
-                    pixels.len()
-                ),
-            };
-            return Err(origin.fault(&message));
+            return Err(match missing {
+                0 => origin.fault(&format!("the pixels of the PSF add up to {light}; expected a positive sum")),
+                _ => origin
+                    .fault(&format!(
+                        "{missing} of {} pixels of the PSF are missing (NaN or infinite; expected none)",
+                        pixels.len()
+                    ))
+                    .hint("a model of the PSF, or values of the neighbours in their place"),
+            });
         }
     }
     Ok(writer.gathered(&files.paths[0], messages, wcs, pixels_of_all))
@@ -147,8 +148,8 @@ fn of_model(
     places: Option<Vec<(f64, f64)>>,
 ) -> Result<GatheredPsfs, FileError> {
     let Some(mut places) = places else {
-        let message = "a model of the PSF is drawn at the galaxies, whose places are not known (expected columns x and y, in FITS pixels of the exposure). Try: --positions";
-        return Err(FileError::new(path, message));
+        let message = "a model of the PSF is drawn at the galaxies, whose places are not known (expected columns x and y, in FITS pixels of the exposure)";
+        return Err(FileError::new(path, message).hint("--positions"));
     };
     // A galaxy beyond the exposure has no pixels here, and a polynomial may have any value there.
     let inside = plan.inside.iter().position(|inside| *inside);
@@ -259,12 +260,15 @@ fn truncated(path: &Path, psf: &Array2<f64>, oversampling: f64) -> Option<String
 
 // Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
 fn small(path: &Path, side: usize) -> Option<String> {
-    let shown = path.display();
     (side < MIN_PSF).then(|| {
-        format!(
-            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {}",
+        let message = format!(
+            "the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require)"
+        );
+        let hint = format!(
+            "larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {}",
             side - side % 2
-        )
+        );
+        format!("warning: {}", FileError::new(path, message).hint(hint))
     })
 }
 
@@ -272,17 +276,13 @@ fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileErr
     if found == 1 || found == mosaic.galaxies {
         return Ok(());
     }
-    let advice = match psf_extension_advice(path) {
-        none if none.is_empty() => {
-            ". Try: average stars before, as average_stars of the crate shearq-measure does".into()
-        }
-        advice => advice,
-    };
     let message = format!(
-        "there are {found} PSFs; expected one, or one for each of the {} stamps{advice}",
+        "there are {found} PSFs; expected one, or one for each of the {} stamps",
         mosaic.galaxies
     );
-    Err(FileError::new(path, message))
+    let average = "average stars before, as average_stars of the crate shearq-measure does";
+    let hint = psf_extension_advice(path).unwrap_or_else(|| average.to_owned());
+    Err(FileError::new(path, message).hint(hint))
 }
 
 fn examined_cut(side: usize) -> PsfCut {

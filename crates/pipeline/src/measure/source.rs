@@ -11,8 +11,8 @@ use shearq_files::fits::ImageReader;
 use shearq_files::open::is_there;
 use shearq_files::table::numbers;
 use shearq_measure::{
-    FunctionalPsf, KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows,
-    StampSource, Star, Threads, Warning,
+    FunctionalPsf, KnownNoise, Lazy, LazyStamps, MeasureError, Measurer, Pixels, Psfs, Session,
+    StampRows, StampSource, Star, Threads, Warning,
 };
 use shearq_quantities::Jacobian;
 use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
@@ -70,7 +70,7 @@ impl ImageSource {
         let stamp = mosaic.stamp;
         // Larger stamps are cut to the size of the configuration; smaller ones have no pixels to fill it with.
         if stamp < configuration.stamp.size {
-            return Err(FileError::new(path, too_small(stamp, configuration)).into());
+            return Err(too_small(&path, stamp, configuration).into());
         }
         let stamps = data.stamps(id.set, id.image);
         let table = match data.layout().great3 {
@@ -151,7 +151,7 @@ impl ImageSource {
 
     pub(super) fn named(&self, error: PipelineError) -> PipelineError {
         match error {
-            PipelineError::Measure(error) => FileError::new(&self.path, error).into(),
+            PipelineError::Measure(error) => about(&self.path)(error).into(),
             other => other,
         }
     }
@@ -245,10 +245,11 @@ fn known_noise(
                 None => "border",
             };
             let message = format!(
-                "the header key NOISESIG is {found}; expected a positive number, which the configuration {} requires. Try: noise.source = \"{other}\", to measure the noise",
+                "the header key NOISESIG is {found}; expected a positive number, which the configuration {} requires",
                 configuration.name
             );
-            Err(FileError::new(path, message))
+            Err(FileError::new(path, message)
+                .hint(format!("noise.source = \"{other}\", to measure the noise")))
         }
         (None, Some(sigma)) => Ok(KnownNoise::Stated(sigma)),
         (None, None) => Ok(KnownNoise::Unknown),
@@ -276,13 +277,20 @@ pub fn settings_for_small_stamps(stamp: usize, configuration: &Configuration) ->
     lines
 }
 
-fn too_small(stamp: usize, configuration: &Configuration) -> String {
+fn about(path: &Path) -> impl Fn(MeasureError) -> FileError {
+    move |error| FileError::with_hint(path, &error, error.hint())
+}
+
+fn too_small(path: &Path, stamp: usize, configuration: &Configuration) -> FileError {
     let Configuration { name, .. } = configuration;
     let needed = configuration.stamp.size;
     let lines = settings_for_small_stamps(stamp, configuration);
-    format!(
-        "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more). Try: --submission own.toml, with the file own.toml of these lines:\n{lines}"
-    )
+    let message = format!(
+        "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more)"
+    );
+    FileError::new(path, message).hint(format!(
+        "--submission own.toml, with the file own.toml of these lines:\n{lines}"
+    ))
 }
 
 /// Opens the galaxies of an image. Their stamps follow from the header, or else from the layout of the data.
@@ -390,10 +398,11 @@ fn open_psfs(
             let path = data.psf_functional(id.set, id.image);
             if !is_there(&path) && is_there(&data.psf_star(id.set, id.image)) {
                 let message = format!(
-                    "the table of functional PSFs is missing, which {} needs; the PSFs of this image are stamps. Try: a configuration for stamps, such as 48/linear/star",
+                    "the table of functional PSFs is missing, which {} needs; the PSFs of this image are stamps",
                     configuration.name
                 );
-                return Err(FileError::new(&path, message));
+                return Err(FileError::new(&path, message)
+                    .hint("a configuration for stamps, such as 48/linear/star"));
             }
             Ok(OpenPsfs {
                 source: open_functional(&path, cut, mosaic)?,
@@ -469,9 +478,9 @@ fn open_star_field(
     if great3::has_varying_psf(data.root(), id.set) {
         let expected = fill(great3::PSF_IMAGES, id.set, id.image);
         let message = format!(
-            "the stars are all over the field, so that each galaxy has another PSF (expected {expected} beside this file). Try: a program that interpolates stars, such as PSFEx or PIFF, to write one PSF stamp per galaxy, as a mosaic like the galaxies' or a cube in the order of their catalogue"
+            "the stars are all over the field, so that each galaxy has another PSF (expected {expected} beside this file)"
         );
-        return Err(FileError::new(path, message));
+        return Err(FileError::new(path, message).hint("a program that interpolates stars, such as PSFEx or PIFF, to write one PSF stamp per galaxy, as a mosaic like the galaxies' or a cube in the order of their catalogue"));
     }
     let mut image = ImageReader::open(path)?;
     let (width, height) = (image.width(), image.height());
@@ -503,7 +512,7 @@ fn open_star_field(
         }
         false => Star::cut(star(0), cut),
     };
-    let star = found.map_err(|error| FileError::new(path, error))?;
+    let star = found.map_err(about(path))?;
     Ok(OpenPsfs {
         moved: star.moved,
         source: PsfSource::Shared(Arc::new(star)),
@@ -558,10 +567,11 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         // The linear method requires one parity.
         let odd = usize::from(cut.centred) * (least - side) % 2;
         let size = side - odd;
-        let message = format!(
-            "the PSF stamp has {side} pixels a side; the configuration requires {least}. Try: larger PSF stamps, or psf.size = {size} in a settings file"
-        );
-        return Err(FileError::new(path, message));
+        let message =
+            format!("the PSF stamp has {side} pixels a side; the configuration requires {least}");
+        return Err(FileError::new(path, message).hint(format!(
+            "larger PSF stamps, or psf.size = {size} in a settings file"
+        )));
     }
     let stars = whole(&image, path, "NSTAMPS", columns * rows)?;
     if let Some(stars) = stars.filter(|stars| *stars != 1 && *stars != mosaic.galaxies) {
@@ -593,7 +603,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
     let pixels = image.read_rows(height)?;
     let stamp = ArrayView2::from_shape((height, width), &pixels)
         .map_err(|error| FileError::new(path, error))?;
-    let star = Star::cut(stamp, cut).map_err(|error| FileError::new(path, error))?;
+    let star = Star::cut(stamp, cut).map_err(about(path))?;
     Ok(OpenPsfs {
         moved: star.moved,
         source: PsfSource::Shared(Arc::new(star)),
@@ -748,15 +758,17 @@ impl Galaxies {
         other: &Galaxies,
         path: &Path,
     ) -> Result<Vec<Option<usize>>, FileError> {
-        let fault = |message: String| Err(FileError::new(path, message));
+        let fault = |message: String| FileError::new(path, message);
         let found = match (&self.ids, &other.ids, &self.sky, &other.sky) {
-            (Some(ids), Some(others), ..) => by_identity(ids, others),
-            (_, _, Some(sky), Some(others)) => by_place(sky, others),
+            (Some(ids), Some(others), ..) => by_identity(ids, others).map_err(fault)?,
+            (_, _, Some(sky), Some(others)) => {
+                by_place(sky, others).map_err(|message| fault(message).hint("a column id"))?
+            }
             _ => {
-                return fault("epochs are joined by the columns id, or ra and dec, which the stamps of one of the images have not (expected them in all images of the set). Try: gather --positions with such columns".to_owned());
+                let message = "epochs are joined by the columns id, or ra and dec, which the stamps of one of the images have not (expected them in all images of the set)";
+                return Err(fault(message.into()).hint("gather --positions with such columns"));
             }
         };
-        let found = found.map_err(|message| FileError::new(path, message))?;
         let count = other.ids.as_ref().map_or_else(
             || other.sky.as_ref().map_or(0, |[ra, _]| ra.len()),
             Vec::len,
@@ -770,10 +782,12 @@ impl Galaxies {
                 (None, Some([ra, dec])) => format!("ra {}, dec {}", ra[row], dec[row]),
                 _ => format!("row {}", row + 1),
             };
-            return fault(format!(
-                "{missing} of {count} galaxies, such as {name}, are not in image {} (expected epochs of the galaxies of the first image of the set). Try: one table of positions for all exposures, or another set",
+            let message = format!(
+                "{missing} of {count} galaxies, such as {name}, are not in image {} (expected epochs of the galaxies of the first image of the set)",
                 first.image
-            ));
+            );
+            let hint = "one table of positions for all exposures, or another set";
+            return Err(fault(message).hint(hint));
         }
         if let (Some(sky), Some(others)) = (&self.sky, &other.sky) {
             for (galaxy, row) in found.iter().enumerate() {
@@ -782,10 +796,13 @@ impl Galaxies {
                 let apart = arcsec(here, there);
                 if apart > OTHER_GALAXY_ARCSEC {
                     let id = other.ids.as_ref().map_or("", |ids| &ids[*row]);
-                    return fault(format!(
-                        "the galaxy of id {id} is {apart:.1}″ from the one of image {} (expected the same galaxy). Try: identities that are the same on all exposures",
+                    let message = format!(
+                        "the galaxy of id {id} is {apart:.1}″ from the one of image {} (expected the same galaxy)",
                         first.image
-                    ));
+                    );
+                    return Err(
+                        fault(message).hint("identities that are the same on all exposures")
+                    );
                 }
             }
         }
@@ -833,7 +850,7 @@ fn by_place(sky: &[Vec<f64>; 2], others: &[Vec<f64>; 2]) -> Result<Vec<Option<us
         match near.next() {
             None => Ok(found),
             Some(_) => Err(format!(
-                "two galaxies are within {SAME_GALAXY_ARCSEC}″ of ra {}, dec {} (expected one). Try: a column id",
+                "two galaxies are within {SAME_GALAXY_ARCSEC}″ of ra {}, dec {} (expected one)",
                 place[0], place[1]
             )),
         }
