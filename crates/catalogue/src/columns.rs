@@ -73,14 +73,12 @@ fn check_own_responses(path: &Path, columns: &BTreeMap<Key, String>) -> Result<(
         &columns[&pairs[k][0]],
         ["e1_1p=none,e1_1m=none", "e2_2p=none,e2_2m=none"][k],
     );
-    Err(FileError::new(
-        path,
-        format!(
-            "`{name}` and its partner give the response of e{} alone (expected e{} under its own artificial shears, too). Try: --columns with its names, or {without}",
-            k + 1,
-            2 - k
-        ),
-    ))
+    let message = format!(
+        "`{name}` and its partner give the response of e{} alone (expected e{} under its own artificial shears, too)",
+        k + 1,
+        2 - k
+    );
+    Err(FileError::new(path, message).hint(format!("--columns with its names, or {without}")))
 }
 
 // Metacalibration of `g1_noshear` is no response of a column `e1` of another method: m was 0.06 for −0.04.
@@ -103,12 +101,9 @@ fn check_sheared_names(
     }
     let other = plus.replace("_1p", "_noshear").replace("_1P", "_NOSHEAR");
     let second = other.replace('1', "2");
-    Err(FileError::new(
-        path,
-        format!(
-            "`{plus}` is no sheared version of `{e1}` (expected e1 with its own response). Try: --columns e1={other},e2={second} for these sheared catalogues, or e1_1p=none,e1_1m=none,e2_2p=none,e2_2m=none for `{e1}` without them"
-        ),
-    ))
+    let message =
+        format!("`{plus}` is no sheared version of `{e1}` (expected e1 with its own response)");
+    Err(FileError::new(path, message).hint(format!("--columns e1={other},e2={second} for these sheared catalogues, or e1_1p=none,e1_1m=none,e2_2p=none,e2_2m=none for `{e1}` without them")))
 }
 
 fn check_partners(
@@ -126,11 +121,14 @@ fn check_partners(
     Err(FileError::new(
         path,
         format!(
-            "there is a column `{column}` but none for {absent} (found {}). Try: --columns {absent}=NAME, or {}=none",
-            names_of(found),
-            name_of(*key)
+            "there is a column `{column}` but none for {absent} (found {})",
+            names_of(found)
         ),
-    ))
+    )
+    .hint(format!(
+        "--columns {absent}=NAME, or {}=none",
+        name_of(*key)
+    )))
 }
 
 impl Survey {
@@ -327,14 +325,13 @@ impl Names {
                 (false, None) => {
                     let file = survey.file.as_deref().unwrap_or(Path::new("--preset"));
                     let (role, names) = (name_of(*key), names_of(found));
-                    return Err(FileError::new(
-                        path,
-                        format!(
-                            "there is no column `{stated}`, which {} states as {role} of `{}` (found {names}). Try: --columns {role}=NAME, or {role}=none",
-                            file.display(),
-                            survey.name
-                        ),
-                    ));
+                    let message = format!(
+                        "there is no column `{stated}`, which {} states as {role} of `{}` (found {names})",
+                        file.display(),
+                        survey.name
+                    );
+                    return Err(FileError::new(path, message)
+                        .hint(format!("--columns {role}=NAME, or {role}=none")));
                 }
             }
         }
@@ -403,9 +400,10 @@ impl Names {
                 return Err(FileError::new(
                     path,
                     format!(
-                        "column `{column}` is given as {first} and as {role} (expected one role). Try: --columns {role}=NAME, or {role}=none"
+                        "column `{column}` is given as {first} and as {role} (expected one role)"
                     ),
-                ));
+                )
+                .hint(format!("--columns {role}=NAME, or {role}=none")));
             }
         }
         Ok(())
@@ -422,10 +420,11 @@ impl Names {
                 return Err(FileError::new(
                     path,
                     format!(
-                        "`{name}` is given as {}, so the true shear is unknown. Try: --truth FILE, --columns g1=NAME,g2=NAME, or g1=none,g2=none for c alone",
+                        "`{name}` is given as {}, so the true shear is unknown",
                         name_of(*key)
                     ),
-                ));
+                )
+                .hint("--truth FILE, --columns g1=NAME,g2=NAME, or g1=none,g2=none for c alone"));
             }
         }
         Ok(())
@@ -563,11 +562,11 @@ impl Columns {
             return Err(FileError::new(
                 path,
                 format!(
-                    "there are no columns of ellipticities (found {}, expected e1 and e2). Try: --columns {}",
-                    names_of(found),
-                    likely_ellipticities(found)
+                    "there are no columns of ellipticities (found {}, expected e1 and e2)",
+                    names_of(found)
                 ),
-            ));
+            )
+            .hint(format!("--columns {}", likely_ellipticities(found))));
         };
         check_partners(path, &columns, found)?;
         let is_distortion = |name: &str| {
@@ -654,12 +653,14 @@ impl Columns {
         let text = flags.find_map(|name| Some((name, self.texts.get(name)?)));
         match text {
             None => Ok(()),
-            Some((name, text)) => Err(FileError::new(
-                path,
-                format!(
-                    "`{name}` has texts (found `{text}` in the first row, expected a flag, which is 0 in good rows). Try: --columns \"flag={name} != 'TEXT'\" with the text of good rows, or flag=none"
-                ),
-            )),
+            Some((name, text)) => {
+                let message = format!(
+                    "`{name}` has texts (found `{text}` in the first row, expected a flag, which is 0 in good rows)"
+                );
+                Err(FileError::new(path, message).hint(format!(
+                    "--columns \"flag={name} != 'TEXT'\" with the text of good rows, or flag=none"
+                )))
+            }
         }
     }
 
@@ -1029,12 +1030,12 @@ fn without_derivatives_alone(
             .iter()
             .find(|(key, _)| is_derivative(key) && names.is_given(key.0));
         if let Some((_, name)) = given {
-            return Err(FileError::new(
-                path,
-                format!(
-                    "`{name}` is given as the derivative of a weight, and there is no column of weights. Try: --columns w=NAME, or dw1=none,dw2=none"
-                ),
-            ));
+            let message = format!(
+                "`{name}` is given as the derivative of a weight, and there is no column of weights"
+            );
+            return Err(
+                FileError::new(path, message).hint("--columns w=NAME, or dw1=none,dw2=none")
+            );
         }
         columns.retain(|key, _| !is_derivative(key));
     }

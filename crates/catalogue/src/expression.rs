@@ -23,6 +23,9 @@ pub enum ExpressionError {
     Step(String),
 }
 
+/// What to try where [`Expression::check_angles`] refuses.
+pub const RADIANS: &str = "radians(ANGLE) for an angle in degrees";
+
 /// A formula such as `flux/flux_error`, or a condition such as `snr > 10 and band == 'r'`.
 #[derive(Debug, Clone)]
 pub struct Expression {
@@ -336,7 +339,7 @@ impl Expression {
     /// by the places of both.
     ///
     /// # Errors
-    /// The message.
+    /// The message, beside which [`RADIANS`] is the hint.
     pub fn check_angles(
         &self,
         rows: usize,
@@ -353,7 +356,7 @@ impl Expression {
         match largest > MAX_ANGLE {
             false => Ok(()),
             true => Err(format!(
-                "`{}` has angles up to {largest:.1} (expected radians, below 8π). Try: radians(ANGLE) for an angle in degrees",
+                "`{}` has angles up to {largest:.1} (expected radians, below 8π)",
                 self.text
             )),
         }
@@ -861,12 +864,10 @@ fn of_integers<'f>(
     }
     let numbers = table::numbers(frame, name, path)?;
     if let Some(large) = numbers.iter().find(|own| own.abs() >= MAX_EXACT_INTEGER) {
-        return Err(FileError::new(
-            path,
-            format!(
-                "column `{name}` has numbers of 2⁵³ or more, whose low bits are lost (found {large:e} for `{shown}`, expected smaller ones, or integers of a FITS, Parquet or Arrow file). Try: such a file, or a column of the low bits"
-            ),
-        ));
+        let message = format!(
+            "column `{name}` has numbers of 2⁵³ or more, whose low bits are lost (found {large:e} for `{shown}`, expected smaller ones, or integers of a FITS, Parquet or Arrow file)"
+        );
+        return Err(FileError::new(path, message).hint("such a file, or a column of the low bits"));
     }
     Ok(operand.of_numbers(numbers))
 }
@@ -903,13 +904,14 @@ pub fn refuse_long_integers(
 ) -> Result<(), FileError> {
     match columns.iter().find(|name| has_long_integers(frame, name)) {
         None => Ok(()),
-        Some(name) => Err(FileError::new(
-            path,
-            format!(
-                "column `{name}` has integers of 2⁵³ or more, which differ by less than their floats (found `{}`, expected smaller ones, or a comparison with an integer). Try: a column of smaller integers, such as the differences from the first one",
+        Some(name) => {
+            let message = format!(
+                "column `{name}` has integers of 2⁵³ or more, which differ by less than their floats (found `{}`, expected smaller ones, or a comparison with an integer)",
                 expression.text()
-            ),
-        )),
+            );
+            Err(FileError::new(path, message)
+                .hint("a column of smaller integers, such as the differences from the first one"))
+        }
     }
 }
 

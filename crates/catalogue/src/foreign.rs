@@ -170,8 +170,10 @@ impl Foreign {
                 .ellipticity
                 .is_none_or(|own| own == Shapes::Responsivity)
         {
-            let message = "`report` is \"distortion\", which needs the type of each ellipticity. Try: `ellipticity` = \"distortion\" or \"shear\"";
-            return Err(FileError::new(path, message));
+            let message = "`report` is \"distortion\", which needs the type of each ellipticity";
+            return Err(
+                FileError::new(path, message).hint("`ellipticity` = \"distortion\" or \"shear\"")
+            );
         }
         foreign.request(path)?;
         check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])

@@ -53,8 +53,8 @@ impl Galaxies {
         if let Some(first) = sources.first()
             && !first.columns.have(&[Role::X, Role::Y])
         {
-            let message = "there are no columns of positions (found none that is called x or y, expected pixels). Try: --columns x=NAME,y=NAME";
-            return Err(FileError::new(path, message));
+            let message = "there are no columns of positions (found none that is called x or y, expected pixels)";
+            return Err(FileError::new(path, message).hint("--columns x=NAME,y=NAME"));
         }
         Ok(Galaxies { sources, ..own })
     }
@@ -178,10 +178,12 @@ impl CalibrationSums {
             .get_or_insert_with(|| (own.path.clone(), kind.clone()));
         if let Some(found) = difference(&kind, first) {
             let message = format!(
-                "its columns are not the columns of {} (found {found}). Try: --columns with the same columns for all",
+                "its columns are not the columns of {} (found {found})",
                 before.display()
             );
-            return Err(FileError::new(&own.path, message));
+            return Err(
+                FileError::new(&own.path, message).hint("--columns with the same columns for all")
+            );
         }
         if !own.need_calibration() {
             return Ok(());
@@ -249,10 +251,11 @@ impl CalibrationSums {
             if !(is_clear && value > 0.0) {
                 let number = k + 1;
                 let message = format!(
-                    "the mean response R{number}{number} of the {} galaxies of this and further catalogues is {value:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear. Try: more galaxies, or --columns R11=none,R22=none if they are shears",
+                    "the mean response R{number}{number} of the {} galaxies of this and further catalogues is {value:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear",
                     own.count()
                 );
-                return Err(FileError::new(path, message));
+                return Err(FileError::new(path, message)
+                    .hint("more galaxies, or --columns R11=none,R22=none if they are shears"));
             }
         }
         Ok(Calibration {

@@ -23,10 +23,10 @@ pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, File
         0 => keys_or_zero(frame, name, path),
         _ => {
             let message = format!(
-                "column `{name}` has no identity in {count} of {} rows; expected one in each. Try: --drop-missing, or --columns id=none",
+                "column `{name}` has no identity in {count} of {} rows; expected one in each",
                 frame.height()
             );
-            Err(FileError::new(path, message))
+            Err(FileError::new(path, message).hint("--drop-missing, or --columns id=none"))
         }
     }
 }

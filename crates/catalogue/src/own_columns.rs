@@ -42,8 +42,8 @@ pub fn is_measured(name: &str) -> bool {
 /// too large by 1/R.
 pub fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
     if names.iter().any(|name| name == "divisor1") {
-        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
-        return Err(FileError::new(path, message));
+        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division)";
+        return Err(FileError::new(path, message).hint("shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns"));
     }
     Ok(())
 }
@@ -60,10 +60,10 @@ pub fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError>
         .hint("detect with another --threshold"));
     }
     if has(WEIGHT) {
-        return Err(FileError::new(
-            path,
-            "this catalogue has a selection already. Try: the catalogue that it was selected from",
-        ));
+        return Err(
+            FileError::new(path, "this catalogue has a selection already")
+                .hint("the catalogue that it was selected from"),
+        );
     }
     if has(Observables::COLUMNS[2]) {
         return Ok(());

@@ -12,7 +12,7 @@ use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Operand, Texts, operand_values, refuse_long_integers, texts_of};
+use crate::expression::{Operand, RADIANS, Texts, operand_values, refuse_long_integers, texts_of};
 use crate::failures::{
     Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears, shown,
 };
@@ -25,7 +25,7 @@ use crate::request::{Input, MAX_AXES, Placed};
 use crate::roles::{CATALOGUES, RESPONSES, Role, sheared_pair};
 use crate::source::{Reading, Source};
 use crate::steps::catalogue_named;
-use crate::truth::{OfRows, check};
+use crate::truth::{OfRows, RADIUS, check};
 
 /// A row that counts, in the catalogue without artificial shear or in a sheared one.
 #[derive(Debug)]
@@ -106,10 +106,10 @@ pub enum Exclusion {
     Missing,
 }
 
-// Why a row gives no galaxy: it is left out, or the message with which the command ends.
+// Why a row gives no galaxy: it is left out, or the message and the hint with which the command ends.
 enum Rejected {
     Excluded(Exclusion),
-    Invalid(String),
+    Invalid(String, Option<String>),
 }
 
 impl From<Exclusion> for Rejected {
@@ -120,7 +120,7 @@ impl From<Exclusion> for Rejected {
 
 impl From<String> for Rejected {
     fn from(message: String) -> Self {
-        Rejected::Invalid(message)
+        Rejected::Invalid(message, None)
     }
 }
 
@@ -213,10 +213,10 @@ pub fn placed_rows(
                         }
                         // A row counts for its first reason.
                         Err(Rejected::Excluded(reason)) => _ = excluded.get_or_insert(reason),
-                        Err(Rejected::Invalid(what)) => {
+                        Err(Rejected::Invalid(what, hint)) => {
                             let row = first + at + 1;
                             let message = format!("row {row}: {what}");
-                            return Err(FileError::new(&source.place.path, message));
+                            return Err(FileError::new(&source.place.path, message).hint_if(hint));
                         }
                     }
                 }
@@ -714,14 +714,17 @@ impl<'a> TableRows<'a> {
     }
 
     // Without it, galaxies that another program excludes by a weight of zero would count fully.
-    fn check_unused_weight(&self, at: usize) -> Result<(), String> {
+    fn check_unused_weight(&self, at: usize) -> Result<(), Rejected> {
         let weights = self.source.places.all((Role::DoubtfulWeight, 0)).iter();
         let mut weights = weights.map(|place| (self.source.name(*place), self.value(*place, at)));
         match weights.find(|(_, value)| !(*value > 0.0 && *value < MIN_FAILED_WEIGHT)) {
             None => Ok(()),
-            Some((name, value)) => Err(format!(
-                "`{name}` looks like a weight but is not used, and is {} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none",
-                shown(value)
+            Some((name, value)) => Err(Rejected::Invalid(
+                format!(
+                    "`{name}` looks like a weight but is not used, and is {} here, so that this galaxy would count wrongly",
+                    shown(value)
+                ),
+                Some(format!("--columns w={name}, or w=none")),
             )),
         }
     }
@@ -738,16 +741,17 @@ impl<'a> TableRows<'a> {
         let of_psf = of_psf.any(|role| self.of(role) == Some(column));
         // A PSF of 2 in all rows is another quantity, rather than a failure in each.
         let all_equal = || self.columns[column].iter().all(|other| *other == value);
-        let remedy: &str = match of_psf && all_equal() {
-            true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
-            false => &self.remedy_for_failures(),
+        let remedy = match of_psf && all_equal() {
+            true => "--columns psf_e1=none,psf_e2=none,psf_size=none".to_owned(),
+            false => self.remedy_for_failures(),
         };
-        Err(Rejected::Invalid(format!(
-            "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {}). Try: {remedy}",
+        let message = format!(
+            "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {})",
             self.source.name(column),
             shown(value),
             check.expected
-        )))
+        );
+        Err(Rejected::Invalid(message, Some(remedy)))
     }
 
     // A column that looks like a flag comes first, because it also excludes failures whose numbers look like measurements.
@@ -808,10 +812,9 @@ impl<'a> TableRows<'a> {
                     true => "a number",
                     false => "a finite number",
                 };
-                Err(Rejected::Invalid(format!(
-                    "{what} is {value} in a row without a flag (expected {expected}). Try: {}",
-                    self.remedy_for_failures()
-                )))
+                let message =
+                    format!("{what} is {value} in a row without a flag (expected {expected})");
+                Err(Rejected::Invalid(message, Some(self.remedy_for_failures())))
             }
         }
     }
@@ -912,19 +915,26 @@ impl<'a> TableRows<'a> {
                 key.map(|shear| (*shear, None)).ok_or_else(|| {
                     let name = self.source.columns.of(Role::Id).unwrap_or_default();
                     let id = identity::text(self.frame, name, at);
-                    format!("the table of true shears does not contain the identifier {id}")
+                    let message =
+                        format!("the table of true shears does not contain the identifier {id}");
+                    Rejected::from(message)
                 })
             }
             OfRows::Positions(positions, columns) => {
-                let found = positions.at(self.pair(columns, at));
+                let [x, y] = self.pair(columns, at);
+                let found = positions.at([x, y]).ok_or_else(|| {
+                    let message = format!("the table of true shears has no galaxy within {RADIUS} pixel of x = {x}, y = {y}");
+                    let hint = "check whether positions begin with 0 or 1, or --drop-missing";
+                    Rejected::Invalid(message, Some(hint.to_owned()))
+                });
                 found.map(|(place, shear)| (shear, Some(place)))
             }
             OfRows::Columns(columns) => Ok((self.pair(columns, at), None)),
         };
         let may_lack = self.reading.request.drop_missing && self.truth.may_lack_rows();
-        found.map_err(|message| match may_lack {
+        found.map_err(|reason| match may_lack {
             true => Exclusion::Missing.into(),
-            false => message.into(),
+            false => reason,
         })
     }
 
@@ -954,7 +964,7 @@ fn check_angles(
         let rows = places.first().map_or(0, |place| columns[*place].len());
         expression
             .check_angles(rows, |at, k| columns[places[k]][at])
-            .map_err(|message| FileError::new(&source.place.path, message))?;
+            .map_err(|message| FileError::new(&source.place.path, message).hint(RADIANS))?;
     }
     Ok(())
 }
@@ -1130,12 +1140,11 @@ impl Found {
         let is_step = |own: &Numbered| !own.others && own.seen.iter().all(|seen| *seen);
         match steps.find(|(_, own)| is_step(own)) {
             None => Ok(()),
-            Some((name, _)) => Err(FileError::new(
-                path,
-                format!(
-                    "column `{name}` has the numbers 0 to 4, as of sheared catalogues. Try: --columns version={name} if 0 is noshear and 1 to 4 are 1p, 1m, 2p and 2m, or version=none if it is another quantity"
-                ),
-            )),
+            Some((name, _)) => {
+                let message =
+                    format!("column `{name}` has the numbers 0 to 4, as of sheared catalogues");
+                Err(FileError::new(path, message).hint(format!("--columns version={name} if 0 is noshear and 1 to 4 are 1p, 1m, 2p and 2m, or version=none if it is another quantity")))
+            }
         }
     }
 
@@ -1158,10 +1167,13 @@ impl Found {
         Err(FileError::new(
             path,
             format!(
-                "`{name}` excludes {rows} of {} rows that would count (expected none). Try: --where '{choice}', or --where '{name} > -1' for all rows",
+                "`{name}` excludes {rows} of {} rows that would count (expected none)",
                 self.used
             ),
-        ))
+        )
+        .hint(format!(
+            "--where '{choice}', or --where '{name} > -1' for all rows"
+        )))
     }
 
     // Of positions in degrees, a galaxy that the table lacks finds another galaxy within one unit.
@@ -1169,13 +1181,11 @@ impl Found {
         if self.shared_truths as f64 <= MAX_SHARED_TRUTHS * self.used as f64 {
             return Ok(());
         }
-        Err(FileError::new(
-            path,
-            format!(
-                "{} of {} rows are within 1 pixel of a place in the table of true shears at which another row is (expected a galaxy for each). Try: x and y in pixels (--columns x=NAME,y=NAME, or formulas), or a table with the columns id, g1, g2",
-                self.shared_truths, self.used
-            ),
-        ))
+        let message = format!(
+            "{} of {} rows are within 1 pixel of a place in the table of true shears at which another row is (expected a galaxy for each)",
+            self.shared_truths, self.used
+        );
+        Err(FileError::new(path, message).hint("x and y in pixels (--columns x=NAME,y=NAME, or formulas), or a table with the columns id, g1, g2"))
     }
 
     // Refuses columns that the user did not name as true shears and that look like measured ones.
@@ -1190,12 +1200,10 @@ impl Found {
             reading.request.names.is_given(Role::G1) || g1.to_ascii_lowercase().contains("tru");
         match self.shears.fault().filter(|_| !is_stated) {
             None => Ok(()),
-            Some(fault) => Err(FileError::new(
-                path,
-                format!(
-                    "`{g1}` and `{g2}` look like measured shears ({fault}). Try: --columns g1=none,g2=none for c alone, --truth FILE, or --columns g1={g1},g2={g2} if they are the true shears"
-                ),
-            )),
+            Some(fault) => {
+                let message = format!("`{g1}` and `{g2}` look like measured shears ({fault})");
+                Err(FileError::new(path, message).hint(format!("--columns g1=none,g2=none for c alone, --truth FILE, or --columns g1={g1},g2={g2} if they are the true shears")))
+            }
         }
     }
 }
@@ -1216,13 +1224,13 @@ fn require_sheared(path: &Path, counts: &[u64; CATALOGUES]) -> Result<(), FileEr
     if absent.is_empty() || found.is_empty() {
         return Ok(());
     }
-    Err(FileError::new(
-        path,
-        format!(
-            "there is no row of {} that counts (found {}, expected rows of all sheared catalogues, whose differences are the response). Try: the table with all of them, or --columns version=none if the ellipticities are calibrated",
-            names_of(&absent),
-            names_of(&found)
-        ),
+    let message = format!(
+        "there is no row of {} that counts (found {}, expected rows of all sheared catalogues, whose differences are the response)",
+        names_of(&absent),
+        names_of(&found)
+    );
+    Err(FileError::new(path, message).hint(
+        "the table with all of them, or --columns version=none if the ellipticities are calibrated",
     ))
 }
 
@@ -1279,15 +1287,13 @@ fn check_share(
     let most = 2 * summary.flagged > summary.rows;
     match recognised_cuts(source, reading).next().filter(|_| most) {
         None => Ok(()),
-        Some(name) => Err(FileError::new(
-            path,
-            format!(
-                "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows). Try: --columns flag=none --where {name} if good rows have 1, --columns flag={} otherwise",
-                summary.flagged,
-                summary.rows,
-                source.columns.flags.join("+")
-            ),
-        )),
+        Some(name) => {
+            let message = format!(
+                "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows)",
+                summary.flagged, summary.rows
+            );
+            Err(FileError::new(path, message).hint(format!("--columns flag=none --where {name} if good rows have 1, --columns flag={} otherwise", source.columns.flags.join("+"))))
+        }
     }
 }
 
@@ -1303,12 +1309,12 @@ fn refuse_boolean_flags(
     };
     match recognised_cuts(source, reading).find(|name| is_boolean(name)) {
         None => Ok(()),
-        Some(name) => Err(FileError::new(
-            &source.place.path,
-            format!(
-                "column `{name}` is true or false (expected a flag, which is 0 for good rows). Try: --columns flag=none --where {name} if it is true for selected rows, --columns flag={name} otherwise"
-            ),
-        )),
+        Some(name) => {
+            let message = format!(
+                "column `{name}` is true or false (expected a flag, which is 0 for good rows)"
+            );
+            Err(FileError::new(&source.place.path, message).hint(format!("--columns flag=none --where {name} if it is true for selected rows, --columns flag={name} otherwise")))
+        }
     }
 }
 
@@ -1319,9 +1325,10 @@ fn sheared_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, 
         FileError::new(
             path,
             format!(
-                "column `{name}`: unknown sheared catalogue (found {found}, expected {expected}). Try: {remedy}"
+                "column `{name}`: unknown sheared catalogue (found {found}, expected {expected})"
             ),
         )
+        .hint(remedy)
     };
     let none = "--columns version=none";
     let Some(texts) = texts_of(frame, name) else {

@@ -1,6 +1,7 @@
 //! Cuts and weights on catalogues of linear configurations, as `--where` and `--weight` state them.
 
 use shearq_measure::{Cut, Quantity, Selection};
+use shearq_quantities::{hints, tried};
 use thiserror::Error;
 
 use crate::expression::{Condition, Expression, ExpressionError, Step};
@@ -18,31 +19,32 @@ pub enum SelectionError {
     Unknown(String),
     #[error("a step of `{0}`: the threshold must be finite and the half width positive")]
     Range(String),
-    #[error(
-        "a step of `{column}` is so narrow that hardly any galaxy lies within it, so that it is a sharp cut without a finite response to shear (found a half width of {found:e}, expected at least {least:.3}). Try: step({column}, THRESHOLD)"
-    )]
+    #[error("a step of `{column}` is so narrow that hardly any galaxy lies within it, so that it is a sharp cut without a finite response to shear (found a half width of {found:e}, expected at least {least:.3}){}", tried(self.hint()))]
     Sharp {
         column: &'static str,
         found: f64,
         least: f64,
     },
     // A sharp cut gives the response the density of galaxies at its edge, which no galaxy by itself determines.
-    #[error(
-        "`{0}` is a condition on a measured quantity, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`, and conditions on positions and on carried columns that --unsheared names). Try: step(NAME, THRESHOLD)"
-    )]
+    #[error("`{}` is a condition on a measured quantity, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`, and conditions on positions and on carried columns that --unsheared names){}", .0, tried(self.hint()))]
     Condition(String),
-    #[error(
-        "`{condition}` is a condition on the column {column}, which shear may change, so that the mean shear would be biased (expected positions, identities, PSF columns, and steps, such as `step(snr, 10)`). Try: --unsheared {column} if it was not measured on these galaxies' images, as a tile or a redshift of a survey"
-    )]
+    #[error("`{condition}` is a condition on the column {column}, which shear may change, so that the mean shear would be biased (expected positions, identities, PSF columns, and steps, such as `step(snr, 10)`){}", tried(self.hint()))]
     Carried { condition: String, column: String },
     #[error(
         "a weight cannot depend on `{0}`, whose response to shear is not known (expected snr, flux or size)"
     )]
     WeightColumn(String),
-    #[error(
-        "the weight `{0}` is not smooth (found a comparison, `abs` or `not`). Try: --where with step()"
-    )]
+    #[error("the weight `{}` is not smooth (found a comparison, `abs` or `not`){}", .0, tried(self.hint()))]
     WeightNotSmooth(String),
+}
+
+impl SelectionError {
+    hints! {
+        Self::Sharp { column, .. } => &format!("step({column}, THRESHOLD)"),
+        Self::Condition(..) => "step(NAME, THRESHOLD)",
+        Self::Carried { column, .. } => &format!("--unsheared {column} if it was not measured on these galaxies' images, as a tile or a redshift of a survey"),
+        Self::WeightNotSmooth(..) => "--where with step()",
+    }
 }
 
 /// What `--where` and `--weight` select, and their texts.

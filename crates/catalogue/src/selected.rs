@@ -34,10 +34,9 @@ pub fn write_selected(
     if let Some(earlier) = &run.selection {
         return Err(FileError::new(
             from,
-            format!(
-                "these catalogues have the selection `{earlier}` already. Try: the folder that they were selected from"
-            ),
-        ));
+            format!("these catalogues have the selection `{earlier}` already"),
+        )
+        .hint("the folder that they were selected from"));
     }
     let files = run.catalogues(from, &[])?;
     // Nothing is written if one of the sets has too few galaxies left.
@@ -50,9 +49,9 @@ pub fn write_selected(
         }
         if let Err(error) = sum.mean() {
             let message = format!(
-                "set {set:02}: the selection leaves no galaxies with a response to shear: {error}. Try: a lower threshold"
+                "set {set:02}: the selection leaves no galaxies with a response to shear: {error}"
             );
-            return Err(FileError::new(from, message));
+            return Err(FileError::new(from, message).hint("a lower threshold"));
         }
     }
     let record = Run {

@@ -45,10 +45,10 @@ fn is_of_psf(path: &Path) -> bool {
 pub fn refuse_sheared_psfs(catalogues: &[Input], names: &Names) -> Result<(), FileError> {
     let mut files = catalogues.iter().filter(|own| own.frame.is_none());
     match files.find(|own| is_of_psf(&own.name)) {
-        Some(own) if !names.is_given(Role::ShearedCatalogue) => Err(FileError::new(
-            &own.name,
-            "the name states an artificial shear of the PSF (expected files of noshear, 1p, 1m, 2p and 2m). Try: without the files of a sheared PSF, or --columns version=none if the name states something else",
-        )),
+        Some(own) if !names.is_given(Role::ShearedCatalogue) => {
+            let message = "the name states an artificial shear of the PSF (expected files of noshear, 1p, 1m, 2p and 2m)";
+            Err(FileError::new(&own.name, message).hint("without the files of a sheared PSF, or --columns version=none if the name states something else"))
+        }
         _ => Ok(()),
     }
 }

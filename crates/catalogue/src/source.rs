@@ -12,7 +12,7 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
 use crate::expression::{
-    Expression, Operand, operand_values, refuse_long_integers, texts_of, with_names,
+    Expression, Operand, RADIANS, operand_values, refuse_long_integers, texts_of, with_names,
 };
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, has_any, names_of_role, recognition, words};
@@ -201,10 +201,9 @@ impl Source {
         let without = role.map_or(String::new(), |role| format!(", or --columns {role}=none"));
         Err(FileError::new(
             &self.place.path,
-            format!(
-                "column `{name}` {found} (expected a number or text in each row). Try: such a column{without}"
-            ),
-        ))
+            format!("column `{name}` {found} (expected a number or text in each row)"),
+        )
+        .hint(format!("such a column{without}")))
     }
 
     // Columns that are not used here, and that `first` does not have.
@@ -572,20 +571,21 @@ fn sources_of(
         return Err(FileError::new(
             path,
             format!(
-                "several tables have columns of ellipticities (found {}, expected one). Try: {}[{advised}]",
-                names_of(&found),
-                path.display(),
+                "several tables have columns of ellipticities (found {}, expected one)",
+                names_of(&found)
             ),
-        ));
+        )
+        .hint(format!("{}[{advised}]", path.display())));
     }
     let Some(list) = good.first().or(lists.first()) else {
         return Err(FileError::new(
             path,
             format!(
-                "the columns have no names (found {} fields, expected a header such as `e1,e2`). Try: write a first line with names",
+                "the columns have no names (found {} fields, expected a header such as `e1,e2`)",
                 found.unnamed.len()
             ),
-        ));
+        )
+        .hint("write a first line with names"));
     };
     let own = match (&place.table, &list.table) {
         (None, Some(head)) => table(head.number),
@@ -1128,12 +1128,10 @@ fn sheared_formulas(
 fn check_calibration(path: &Path, columns: &Columns, in_rows: bool) -> Result<(), FileError> {
     let calibration = [Role::M, Role::C1, Role::C2].map(|role| columns.of(role));
     if let Some(name) = calibration.into_iter().flatten().next().filter(|_| in_rows) {
-        return Err(FileError::new(
-            path,
-            format!(
-                "`{name}`: m and c of galaxies are not applied to sheared catalogues, whose response is that of their means. Try: m=none,c1=none,c2=none in --columns"
-            ),
-        ));
+        let message = format!(
+            "`{name}`: m and c of galaxies are not applied to sheared catalogues, whose response is that of their means"
+        );
+        return Err(FileError::new(path, message).hint("m=none,c1=none,c2=none in --columns"));
     }
     Ok(())
 }
@@ -1145,10 +1143,11 @@ fn check_twice(path: &Path, names: &[String], wanted: &[Operand]) -> Result<(), 
         return Err(FileError::new(
             path,
             format!(
-                "there are two columns named `{}` (expected one). Try: other names",
+                "there are two columns named `{}` (expected one)",
                 twice.column
             ),
-        ));
+        )
+        .hint("other names"));
     }
     Ok(())
 }
@@ -1354,7 +1353,7 @@ pub fn add_formulas(
         let operands: Vec<_> = operands.collect::<Result<_, _>>()?;
         formula
             .check_angles(part.height(), |at, k| operands[k][at])
-            .map_err(|message| FileError::new(path, message))?;
+            .map_err(|message| FileError::new(path, message).hint(RADIANS))?;
         let values = (0..part.height()).map(|at| formula.value(&|k| operands[k][at]));
         let values: Vec<f64> = values.collect();
         let column = Column::new(formula.text().into(), values);
@@ -1429,12 +1428,9 @@ fn conversion(
         Some(shapes) => return Ok(shapes),
     };
     let named = response.unwrap_or("the sheared catalogues");
-    Err(FileError::new(
-        path,
-        format!(
-            "`{named}`: with --ellipticity {option}, this response is not used, because {why}. Try: --ellipticity shear, which divides the ellipticities by their response whatever their type, or R11=none,R22=none in --columns without it"
-        ),
-    ))
+    let message =
+        format!("`{named}`: with --ellipticity {option}, this response is not used, because {why}");
+    Err(FileError::new(path, message).hint("--ellipticity shear, which divides the ellipticities by their response whatever their type, or R11=none,R22=none in --columns without it"))
 }
 
 // Whether shear does not change a column, judged by its role and name.
@@ -1457,10 +1453,9 @@ fn check_chosen<'a>(
         if let Some((_, base)) = sheared_name(name).filter(|(_, base)| has_sheared(base)) {
             return Err(FileError::new(
                 path,
-                format!(
-                    "`{name}` belongs to one sheared catalogue (expected a column of all). Try: {base}"
-                ),
-            ));
+                format!("`{name}` belongs to one sheared catalogue (expected a column of all)"),
+            )
+            .hint(base));
         }
         if changes_with_shear(name) && !has_sheared(name) {
             return Err(FileError::new(
@@ -1487,9 +1482,10 @@ fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
         Some(stated) if stated != step => Err(FileError::new(
             path,
             format!(
-                "the sheared catalogues are for another shear (found {stated}, expected {step}). Try: --step {stated}"
+                "the sheared catalogues are for another shear (found {stated}, expected {step})"
             ),
-        )),
+        )
+        .hint(format!("--step {stated}"))),
         _ => Ok(()),
     }
 }

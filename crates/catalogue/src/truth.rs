@@ -169,10 +169,10 @@ impl Truth {
             let is_file = Path::new(name).file_name() == path.file_name();
             if let Some(other) = files.insert(name, path).filter(|_| is_file) {
                 let message = format!(
-                    "`{name}` in the table of true shears is this catalogue and {}; expected one. Try: the folder before the name",
+                    "`{name}` in the table of true shears is this catalogue and {}; expected one",
                     other.display()
                 );
-                return Err(FileError::new(path, message));
+                return Err(FileError::new(path, message).hint("the folder before the name"));
             }
             found.insert(path.display().to_string(), all[name]);
         }
@@ -192,10 +192,8 @@ pub enum OfRows<'a> {
 impl<'a> OfRows<'a> {
     pub fn new(path: &Path, places: &Places, truth: &'a Truth) -> Result<Self, FileError> {
         let absent = |what: &str, option: &str| {
-            let message = format!(
-                "the catalogue has no {what} to find the true shear with. Try: --columns {option}"
-            );
-            FileError::new(path, message)
+            let message = format!("the catalogue has no {what} to find the true shear with");
+            FileError::new(path, message).hint(format!("--columns {option}"))
         };
         let by_position = |positions| {
             let columns = places.pair([Role::X, Role::Y]);
@@ -217,8 +215,9 @@ impl<'a> OfRows<'a> {
                 Some(positions) => by_position(positions),
                 None => Err(FileError::new(
                     path,
-                    "this catalogue has no known true shear, but the folders have one. Try: separate commands, or --truth FILE",
-                )),
+                    "this catalogue has no known true shear, but the folders have one",
+                )
+                .hint("separate commands, or --truth FILE")),
             },
             Truth::Columns => Ok(match places.pair([Role::G1, Role::G2]) {
                 Some(columns) => OfRows::Columns(columns),
@@ -273,18 +272,18 @@ fn row_of<'n>(
                 names_of(&all)
             ),
         )),
-        [first, second, ..] => Err(FileError::new(
-            path,
-            format!(
-                "`{first}` and `{second}` in the table of true shears both fit this catalogue; expected one. Try: longer names"
-            ),
-        )),
+        [first, second, ..] => {
+            let message = format!(
+                "`{first}` and `{second}` in the table of true shears both fit this catalogue; expected one"
+            );
+            Err(FileError::new(path, message).hint("longer names"))
+        }
     }
 }
 
 // Largest distance of a galaxy from its place in the truth, in pixels: centroids of detections differ by less, and first
 // pixels of 0 and of 1 by more.
-const RADIUS: f64 = 1.0;
+pub(crate) const RADIUS: f64 = 1.0;
 
 // Places that are looked at, and the part of them that may have another shear within [`RADIUS`]: at 100 galaxies per arcmin² on
 // pixels of 0.2 arcsec, 0.3 % have one. Chosen by hand.
@@ -354,13 +353,12 @@ impl Positions {
             (pair[0].x, pair[0].y) == (pair[1].x, pair[1].y) && pair[0].shear != pair[1].shear
         };
         if let Some([a, b]) = entries.windows(2).find(contradictory) {
-            return Err(FileError::new(
-                path,
-                format!(
-                    "the position x = {}, y = {} has two true shears (found {:?} and {:?}, expected one). Try: a table per catalogue, or the columns id, g1, g2",
-                    a.x, a.y, a.shear, b.shear
-                ),
-            ));
+            let message = format!(
+                "the position x = {}, y = {} has two true shears (found {:?} and {:?}, expected one)",
+                a.x, a.y, a.shear, b.shear
+            );
+            return Err(FileError::new(path, message)
+                .hint("a table per catalogue, or the columns id, g1, g2"));
         }
         Ok(Positions { entries })
     }
@@ -391,10 +389,11 @@ impl Positions {
         Err(FileError::new(
             path,
             format!(
-                "{:.0} % of the places have another true shear within {RADIUS} (found by x and y, expected pixels, in which galaxies lie farther apart). Degrees or arc minutes? Try: x and y in pixels in this table and the catalogues, or the columns id, g1, g2",
+                "{:.0} % of the places have another true shear within {RADIUS} (found by x and y, expected pixels, in which galaxies lie farther apart). Degrees or arc minutes?",
                 100.0 * near as f64 / count as f64
             ),
-        ))
+        )
+        .hint("x and y in pixels in this table and the catalogues, or the columns id, g1, g2"))
     }
 
     // Places within [`RADIUS`], with their distances.
@@ -432,13 +431,9 @@ impl Positions {
     }
 
     /// The number of the nearest place within [`RADIUS`], and its shear.
-    pub fn at(&self, [x, y]: [f64; 2]) -> Result<(usize, [f64; 2]), String> {
-        let nearest = self.find([x, y]);
-        nearest.map(|place| (place, self.entries[place].shear)).ok_or_else(|| {
-            format!(
-                "the table of true shears has no galaxy within {RADIUS} pixel of x = {x}, y = {y}. Try: check whether positions begin with 0 or 1, or --drop-missing"
-            )
-        })
+    pub fn at(&self, position: [f64; 2]) -> Option<(usize, [f64; 2])> {
+        let nearest = self.find(position);
+        nearest.map(|place| (place, self.entries[place].shear))
     }
 }
 
@@ -479,10 +474,9 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError
             let parts = parts_of_folder(path)?;
             if parts.is_empty() {
                 let message = format!(
-                    "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
-                    path.display()
+                    "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote)"
                 );
-                return Err(FileError::new(path, message));
+                return Err(FileError::new(path, message).hint(format!("{}/*", path.display())));
             }
             catalogues.push(Input {
                 name: path.clone(),
@@ -516,8 +510,8 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError
     }
     if !found.is_empty() {
         if let Some(path) = without {
-            let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
-            return Err(FileError::new(path, message));
+            let message = "its data have no true shear, but the data of other folders have one";
+            return Err(FileError::new(path, message).hint("separate commands, or --truth FILE"));
         }
         truth = Truth::Data(found);
     }
@@ -587,10 +581,9 @@ fn images_without_catalogue(
 
 fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {
     let data = run.source.data(folder).map_err(|error| {
-        let message = format!(
-            "the data with the true shear are gone ({error}). Try: --truth FILE, or the catalogues themselves without a true shear"
-        );
+        let message = format!("the data with the true shear are gone ({error})");
         FileError::new(folder, message)
+            .hint("--truth FILE, or the catalogues themselves without a true shear")
     })?;
     let path = data.truth(set);
     if !is_there(&path) {
@@ -634,7 +627,7 @@ mod tests {
             ([5.0, 5.0], None),
         ] {
             assert_eq!(
-                found.at(position).ok().map(|(_, g)| g[0]),
+                found.at(position).map(|(_, g)| g[0]),
                 expected,
                 "{position:?}"
             );
