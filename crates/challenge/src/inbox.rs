@@ -248,14 +248,15 @@ pub struct Content {
 /// Reads the manifest of an entry that unpacks to `most` bytes at most, and the checksum of its content.
 pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
     let path = &sending.path;
-    let wrong = |message: String| Err(FileError::new(path, message));
+
     let (manifest, files) = match path.is_dir() {
         // Catalogues of `measure` have other names and contents than catalogues of an entry.
         true if path.join(RUN_FILE).is_file() => {
-            return wrong(format!(
-                "this folder was written by `measure` or `run`; expected an entry. Try: shearq pack --measured {0} --out {0}.tar.gz",
+            let message = "this folder was written by `measure` or `run`; expected an entry";
+            return Err(FileError::new(path, message).hint(format!(
+                "shearq pack --measured {0} --out {0}.tar.gz",
                 path.display()
-            ));
+            )));
         }
         true => (Manifest::read(path)?, FileSum::of_files(&files_of(path)?)?),
         false if has_archive(path) => {
@@ -264,7 +265,8 @@ pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
             (unpacked.manifest, unpacked.files.into_iter().collect())
         }
         false => {
-            return wrong("not an archive that can be read (expected .tar.gz or .zip)".into());
+            let message = "not an archive that can be read (expected .tar.gz or .zip)";
+            return Err(FileError::new(path, message));
         }
     };
     let mut sums: Vec<(String, FileSum)> = files

@@ -274,10 +274,13 @@ impl Judge {
             match (&receipt, &sending.team) {
                 (Some(receipt), Some(team)) if team_key(&receipt.team) != team_key(team) => {
                     let message = format!(
-                        "the receipt is of another team (found `{0}`, expected the folder's `{team}`). Try: move both into the folder `{0}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
+                        "the receipt is of another team (found `{}`, expected the folder's `{team}`)",
                         receipt.team
                     );
-                    Err(FileError::new(Receipt::path(path), message))
+                    Err(FileError::new(Receipt::path(path), message).hint(format!(
+                        "move both into the folder `{}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
+                        receipt.team
+                    )))
                 }
                 _ => Ok(receipt),
             }

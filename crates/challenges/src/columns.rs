@@ -116,10 +116,12 @@ impl Columns<'_> {
         };
         if let Some(words) = found.remarks.iter().find(states_names) {
             let message = format!(
-                "found {count} columns below the comment {}, expected one word per column. Try: these names alone, or no comment of them",
+                "found {count} columns below the comment {}, expected one word per column",
                 words.join(" ")
             );
-            return wrong(path, message);
+            return Err(
+                FileError::new(path, message).hint("these names alone, or no comment of them")
+            );
         }
         let number = |k: usize| places.get(k).map(|place| (place + 1).to_string());
         Ok((0..self.names.len()).map(number).collect())

@@ -112,10 +112,9 @@ fn read_entry(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
 
 fn refuse(option: &str, given: bool) -> Result<(), FileError> {
     match given {
-        true => wrong(
-            Path::new(option),
-            "GREAT08 has no use for it. Try: without this option",
-        ),
+        true => {
+            Err(FileError::new(option, "GREAT08 has no use for it").hint("without this option"))
+        }
         false => Ok(()),
     }
 }

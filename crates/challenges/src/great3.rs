@@ -279,13 +279,8 @@ impl Great3 {
         let of_submission = |error| FileError::new(submission, error);
         let fields = self.fields(truth.subfields)?;
         if let Some(psf) = truth.psf {
-            return wrong(
-                psf,
-                format!(
-                    "--psf: Q_v of {} has no use for the PSF. Try: without --psf",
-                    self.0
-                ),
-            );
+            let message = format!("--psf: Q_v of {} has no use for the PSF", self.0);
+            return Err(FileError::new(psf, message).hint("without --psf"));
         }
         let masses = self.true_masses(truth.path, fields, pool)?;
         let submitted = self.submitted_masses(submission, fields)?;

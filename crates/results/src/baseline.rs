@@ -14,6 +14,7 @@ use shearq_dataset::run::{Run, Source, differences, shortened};
 use shearq_dataset::threads::Pool;
 use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
+use shearq_quantities::{hints, tried};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::{Metric, Metrics, Options};
 use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
@@ -254,10 +255,14 @@ pub enum BaselineError {
     },
     #[error("set {set} could not be measured again (found no such set in the data)")]
     NoSet { set: u32 },
-    #[error(
-        "the data of set {set} are not the baseline's ({then} images then, {now} now), so that metrics differ by noise. Try: --update if they changed on purpose"
-    )]
+    #[error("the data of set {set} are not the baseline's ({then} images then, {now} now), so that metrics differ by noise{}", tried(self.hint()))]
     OtherData { set: u32, then: usize, now: usize },
+}
+
+impl BaselineError {
+    hints! {
+        Self::OtherData { .. } => "--update if they changed on purpose",
+    }
 }
 
 fn settings_error<E: Into<Box<dyn std::error::Error + Send + Sync>>>(

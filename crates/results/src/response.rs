@@ -294,20 +294,23 @@ fn refuse_seen(
 
 // TreeCorr takes right ascension and declination on the sky, where our signs are its own, or x and y of the pixels' axes.
 fn check_positions(path: &Path, treecorr: Option<Position>, axes: Axes) -> Result<(), FileError> {
-    let message = match treecorr {
-        Some(Position::Sky) if axes == Axes::Pixel => {
-            "the ellipticities are along pixel axes whose orientation on the sky no WCS states (found no WCS; expected `sky`). Try: --treecorr x,y"
-        }
+    let (message, hint) = match treecorr {
+        Some(Position::Sky) if axes == Axes::Pixel => (
+            "the ellipticities are along pixel axes whose orientation on the sky no WCS states (found no WCS; expected `sky`)",
+            "--treecorr x,y",
+        ),
         // Pixel axes that a WCS states to be the sky's are as good as `mean` takes them.
-        Some(Position::Sky) if !axes.agree(Axes::Sky) => {
-            "the ellipticities are in the frame of the pixels, so that they have no direction on the sky (found `pixel`; expected `sky`). Try: gather --frame sky, or --treecorr x,y"
-        }
-        Some(Position::Pixel) if axes.frame() == Frame::Sky => {
-            "the ellipticities are in the frame of the sky, so that they have no direction along x and y (found `sky`; expected `pixel`). Try: --treecorr ra,dec"
-        }
+        Some(Position::Sky) if !axes.agree(Axes::Sky) => (
+            "the ellipticities are in the frame of the pixels, so that they have no direction on the sky (found `pixel`; expected `sky`)",
+            "gather --frame sky, or --treecorr x,y",
+        ),
+        Some(Position::Pixel) if axes.frame() == Frame::Sky => (
+            "the ellipticities are in the frame of the sky, so that they have no direction along x and y (found `sky`; expected `pixel`)",
+            "--treecorr ra,dec",
+        ),
         _ => return Ok(()),
     };
-    Err(FileError::new(path, message))
+    Err(FileError::new(path, message).hint(hint))
 }
 
 impl Image {

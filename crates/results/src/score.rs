@@ -10,6 +10,7 @@ use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_quantities::Frame;
+use shearq_quantities::{hints, tried};
 use shearq_scoring::{
     AddedImages, Choice, ConventionMatch, Fault, FieldSum, Grid, OddImages, Options, RowCounts,
     ScoredImages, ScoringError, SetScore, SetSession, TruthSign, sign_by_correlation,
@@ -39,16 +40,22 @@ pub enum ScoreError {
     NoCatalogueOf(String),
     #[error("the catalogues have no set in common")]
     NoCommonSet,
-    #[error(
-        "cannot determine the sets, because no `catalogues` contains {{set}}. Try: add {{set}} to the pattern"
-    )]
+    #[error("cannot determine the sets, because no `catalogues` contains {{set}}{}", tried(self.hint()))]
     NoSetNumber,
-    #[error("--foreign needs the true shear. Try: --data DIR")]
+    #[error("--foreign needs the true shear{}", tried(self.hint()))]
     NoTruth,
     #[error(transparent)]
     Configuration(#[from] ConfigurationError),
     #[error(transparent)]
     Threads(#[from] ThreadError),
+}
+
+impl ScoreError {
+    hints! {
+        Self::File(error) => return error.hint.clone(),
+        Self::NoSetNumber => "add {set} to the pattern",
+        Self::NoTruth => "--data DIR",
+    }
 }
 
 /// A scored set: its record, and what only its notes and plots need.

@@ -116,15 +116,21 @@ fn check_name(path: &Path, expected: &str) -> Result<(), FileError> {
         let is_hash = hash.len() == 16 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
         is_hash.then(|| hash.to_owned())
     };
-    let message = match (hash(&name), hash(expected)) {
-        (Some(own), Some(content)) if own != content => format!(
-            "the file was changed after it was recorded (found content {content}, expected {own} as in its name). Try: remove it, and shearq score --measured OUT --store DIR"
+    let (message, hint) = match (hash(&name), hash(expected)) {
+        (Some(own), Some(content)) if own != content => (
+            format!(
+                "the file was changed after it was recorded (found content {content}, expected {own} as in its name)"
+            ),
+            "remove it, and shearq score --measured OUT --store DIR",
         ),
-        _ => format!(
-            "the file was renamed or copied after it was recorded (expected the name {expected}). Try: that name; remove the file if it was edited, too, or if there is one of that name"
+        _ => (
+            format!(
+                "the file was renamed or copied after it was recorded (expected the name {expected})"
+            ),
+            "that name; remove the file if it was edited, too, or if there is one of that name",
         ),
     };
-    Err(FileError::new(path, message))
+    Err(FileError::new(path, message).hint(hint))
 }
 
 /// The run of each file of a store, in order of the names.

@@ -95,7 +95,7 @@ impl Great3 {
             let stem = file_name(released::SHEARS, subfield, 0);
             match Parameters::read(&folder, &stem)? {
                 Some(found) => shear_of(&found),
-                None => wrong(&folder, missing(&stem, fields * per)),
+                None => Err(missing(&folder, &stem, fields * per)),
             }
         };
         refuse_more(&folder, released::SHEARS, fields * per)?;
@@ -122,7 +122,7 @@ impl Great3 {
         let (subfields, epochs) = (fields * self.0.subfields_per_field(), self.0.epochs());
         let source = truth.psf.unwrap_or(truth.path);
         if truth.psf.is_none() && !source.is_dir() {
-            return wrong(source, "Q_c needs the PSF. Try: --psf FILE");
+            return Err(FileError::new(source, "Q_c needs the PSF").hint("--psf FILE"));
         }
         let known = match source.is_dir() {
             true => self.psfs_of_folder(source, subfields)?,
@@ -277,9 +277,9 @@ impl Great3 {
             let Some(bin) = separations().iter().position(|centre| is(centre.0)) else {
                 let [first, last] = [0, SEPARATION_BINS - 1].map(|bin| separations()[bin].0);
                 let message = format!(
-                    "field {field}: theta is {theta}, expected one of the {SEPARATION_BINS} centres {first:.4} to {last:.4} degrees to 3 decimals. Try: shearq pack --challenge great3"
+                    "field {field}: theta is {theta}, expected one of the {SEPARATION_BINS} centres {first:.4} to {last:.4} degrees to 3 decimals"
                 );
-                return wrong(path, message);
+                return Err(FileError::new(path, message).hint("shearq pack --challenge great3"));
             };
             for (name, column) in [("map_E", 2), ("map_B", 3), ("error", 4)] {
                 let found = columns[column][k];
@@ -345,16 +345,11 @@ impl Great3 {
             |subfield: usize| folder.join(file_name(released::GALAXY_CATALOGUES, subfield, 0));
         let subfields = fields * SUBFIELDS_PER_FIELD;
         if let Some(lacking) = (0..subfields).find(|k| !is_there(&catalogue(*k))) {
-            return wrong(
-                &folder,
-                missing(
-                    &stem_of(&file_name(released::GALAXY_CATALOGUES, lacking, 0)),
-                    subfields,
-                ),
-            );
+            let stem = stem_of(&file_name(released::GALAXY_CATALOGUES, lacking, 0));
+            return Err(missing(&folder, &stem, subfields));
         }
         if is_there(&catalogue(subfields)) {
-            return wrong(&catalogue(subfields), more_subfields(subfields));
+            return Err(more_subfields(&catalogue(subfields), subfields));
         }
         let fields = (0..subfields).step_by(SUBFIELDS_PER_FIELD);
         let masses = pool.in_order(fields, |first| {
@@ -382,22 +377,20 @@ fn stem_of(name: &str) -> String {
     name.trim_end_matches(".fits").to_owned()
 }
 
-fn missing(stem: &str, subfields: usize) -> String {
-    format!(
-        "found no {stem}.*, expected {subfields} subfields. Try: --subfields N if the branch was simulated with fewer"
-    )
+fn missing(folder: &Path, stem: &str, subfields: usize) -> FileError {
+    let message = format!("found no {stem}.*, expected {subfields} subfields");
+    FileError::new(folder, message).hint("--subfields N if the branch was simulated with fewer")
 }
 
-fn more_subfields(subfields: usize) -> String {
-    format!(
-        "expected {subfields} subfields. Try: --subfields N if the branch was simulated with more"
-    )
+fn more_subfields(path: &Path, subfields: usize) -> FileError {
+    FileError::new(path, format!("expected {subfields} subfields"))
+        .hint("--subfields N if the branch was simulated with more")
 }
 
 // Refuses files of a subfield after the last: a part of the branch would be scored as the whole.
 fn refuse_more(folder: &Path, pattern: &str, subfields: usize) -> Result<(), FileError> {
     match Parameters::read(folder, &file_name(pattern, subfields, 0))? {
-        Some(more) => wrong(&more.path, more_subfields(subfields)),
+        Some(more) => Err(more_subfields(&more.path, subfields)),
         None => Ok(()),
     }
 }
@@ -471,10 +464,10 @@ fn add_truth(
     let is_constant = |column: &[f64]| side > 1 && column.iter().all(|g| *g == column[0]);
     if is_constant(&columns[1]) && is_constant(&columns[2]) {
         let message = format!(
-            "all galaxies have the true shear {} {}, expected one that varies. Try: --branch with constant shear",
+            "all galaxies have the true shear {} {}, expected one that varies",
             columns[1][0], columns[2][0]
         );
-        return wrong(path, message);
+        return Err(FileError::new(path, message).hint("--branch with constant shear"));
     }
     let mut seen = BTreeSet::new();
     for (k, &found) in columns[0].iter().enumerate() {

@@ -30,10 +30,10 @@ const GALAXIES: Columns<'static> = Columns {
     unnamed: &[(3, &[0, 1, 2]), (4, &[0, 1, 2, 3]), (6, &[0, 3, 4, 5])],
 };
 
-fn unmeasured(field: usize) -> String {
-    format!(
-        "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
-    )
+fn unmeasured(file: &Path, field: usize) -> FileError {
+    let message =
+        format!("field {field} has no measured galaxy with a weight, so that it has no shear");
+    FileError::new(file, message).hint("a smaller cut on quality")
 }
 
 fn subfields(packing: &Presubmitting<'_>) -> usize {
@@ -81,9 +81,11 @@ impl Galaxies {
                         && columns[3].is_empty()
                     {
                         let message = format!(
-                            "`{name}` looks like a weight but is not used (expected `weight` or `w`). Try: rename it to weight, or remove it"
+                            "`{name}` looks like a weight but is not used (expected `weight` or `w`)"
                         );
-                        return wrong(path, message);
+                        return Err(
+                            FileError::new(path, message).hint("rename it to weight, or remove it")
+                        );
                     }
                     all.unused.extend(unused);
                     all.add(path, &columns, packing)?;
@@ -134,34 +136,37 @@ impl Galaxies {
             let Some(id) = Identity::of_number(found) else {
                 return wrong(path, not_an_identity(k, found));
             };
-            let wrong = |fault: String| wrong(path, format!("galaxy {id}: {fault}"));
+            let fault = |what: String| FileError::new(path, format!("galaxy {id}: {what}"));
             if id.subfield() >= subfields(packing) {
-                return wrong(format!(
-                    "subfield {} does not exist in {branch} (expected 0 to {}). Try: only the catalogues of one branch",
+                return Err(fault(format!(
+                    "subfield {} does not exist in {branch} (expected 0 to {})",
                     id.subfield(),
                     subfields(packing) - 1
-                ));
+                ))
+                .hint("only the catalogues of one branch"));
             }
             let (x, y) = id.place();
             let last = grid(packing) * self.step() - 1;
             if x.max(y) > last {
-                return wrong(format!(
-                    "column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
-                ));
+                return Err(fault(format!(
+                    "column {x} and row {y} are outside of the grid (expected 0 to {last})"
+                ))
+                .hint("--branch with the branch of these identities"));
             }
             let g = Shear::new(columns[1][k], columns[2][k]);
             for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
                 if found <= -NOT_AVERAGED {
-                    return wrong(format!(
-                        "{name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
-                    ));
+                    return Err(fault(format!(
+                        "{name} is {found}, which the challenge's program would average"
+                    ))
+                    .hint("10 for a galaxy that was not measured"));
                 }
             }
             let weight = columns[3].get(k).copied().unwrap_or(1.0);
             if !(weight.is_finite() && weight >= 0.0) {
-                return wrong(format!(
+                return Err(fault(format!(
                     "the weight is {weight}, expected zero or a positive number"
-                ));
+                )));
             }
             self.galaxies.push(Galaxy {
                 id,
@@ -185,11 +190,11 @@ impl Galaxies {
             .find(|pair| pair[0].id == pair[1].id)
         {
             let message = format!(
-                "galaxy {} is there twice; it is also in {}. Try: remove one of the two rows",
+                "galaxy {} is there twice; it is also in {}",
                 pair[0].id,
                 file(&pair[0]).display()
             );
-            return wrong(file(&pair[1]), message);
+            return Err(FileError::new(file(&pair[1]), message).hint("remove one of the two rows"));
         }
         let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
         let last = self
@@ -204,11 +209,12 @@ impl Galaxies {
             let which = first.collect::<Vec<_>>().join(", ");
             let which = which + if lacking.len() > 5 { ", …" } else { "" };
             let message = format!(
-                "{} of {} subfields are missing: {which}. Try: the catalogues of all subfields in one command",
+                "{} of {} subfields are missing: {which}",
                 lacking.len(),
                 subfields(packing)
             );
-            return wrong(last, message);
+            return Err(FileError::new(last, message)
+                .hint("the catalogues of all subfields in one command"));
         }
         for subfield in self
             .galaxies
@@ -231,12 +237,14 @@ impl Galaxies {
         let expected = offset(first.id);
         if let Some(odd) = galaxies.iter().find(|own| offset(own.id) != expected) {
             let message = format!(
-                "galaxy {}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {:?}, expected {expected:?} as of {}). Try: the identities of galaxy_catalog-*.fits",
+                "galaxy {}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {:?}, expected {expected:?} as of {})",
                 odd.id,
                 offset(odd.id),
                 first.id
             );
-            return wrong(file(odd), message);
+            return Err(
+                FileError::new(file(odd), message).hint("the identities of galaxy_catalog-*.fits")
+            );
         }
         let measured =
             |own: &&Galaxy| own.weight > 0.0 && own.g.e1 < NOT_AVERAGED && own.g.e2 < NOT_AVERAGED;
@@ -251,9 +259,11 @@ impl Galaxies {
                 rows, of, value, ..
             } = found;
             let message = format!(
-                "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat. Try: 10 for a galaxy that was not measured"
+                "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat"
             );
-            return wrong(file(first), message);
+            return Err(
+                FileError::new(file(first), message).hint("10 for a galaxy that was not measured")
+            );
         }
         let count = grid(packing) * grid(packing);
         let found = galaxies.len();
@@ -265,9 +275,10 @@ impl Galaxies {
             let id = all.find(|id| !there.contains(id)).unwrap_or(first.id);
             let more = more(count - found);
             let message = format!(
-                "galaxy {id} is missing{more}: subfield {subfield} has {found} galaxies, expected {count}. Try: a row with g1 = g2 = 10 for each galaxy that was not measured"
+                "galaxy {id} is missing{more}: subfield {subfield} has {found} galaxies, expected {count}"
             );
-            return wrong(file(first), message);
+            return Err(FileError::new(file(first), message)
+                .hint("a row with g1 = g2 = 10 for each galaxy that was not measured"));
         }
         Ok(())
     }
@@ -299,7 +310,7 @@ impl Galaxies {
                     }
                     match weight > 0.0 {
                         true => Ok(sum / weight),
-                        false => wrong(file, unmeasured(field)),
+                        false => Err(unmeasured(file, field)),
                     }
                 };
                 let g1 = mean(|g| g.e1, |g| g.e2)?;
@@ -320,7 +331,7 @@ impl Galaxies {
                 self.masses(&self.galaxies[range], limit)
                     .map_err(|fault| match fault {
                         Some(error) => error,
-                        None => FileError::new(file, unmeasured(field)),
+                        None => unmeasured(file, field),
                     })
             });
             for (field, own) in masses.enumerate() {

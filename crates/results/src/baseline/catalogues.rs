@@ -10,6 +10,7 @@ use shearq_catalogue::roles::named;
 use shearq_dataset::fingerprint;
 use shearq_files::open::{self, SETTINGS};
 use shearq_files::{FileError, atomic};
+use shearq_quantities::{hints, tried};
 use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
 use shearq_scoring::{Convention, Metric, Metrics};
 use thiserror::Error;
@@ -203,14 +204,21 @@ pub enum CatalogueError {
     Bias(#[from] BiasFailure),
     #[error("{}", .0)]
     Estimate(#[from] shearq_bias::BiasError),
-    #[error(
-        "{what} are not the baseline's (found {found}, expected {expected}): a paired difference needs the same galaxies. Try: --update if they changed on purpose"
-    )]
+    #[error("{what} are not the baseline's (found {found}, expected {expected}): a paired difference needs the same galaxies{}", tried(self.hint()))]
     OtherGalaxies {
         what: String,
         found: String,
         expected: String,
     },
+}
+
+impl CatalogueError {
+    hints! {
+        Self::File(error) => return error.hint.clone(),
+        Self::Bias(error) => return error.hint(),
+        Self::Estimate(error) => return error.hint(),
+        Self::OtherGalaxies { .. } => "--update if they changed on purpose",
+    }
 }
 
 fn same<T: PartialEq>(

@@ -269,13 +269,13 @@ impl<'r> Survey<'r> {
             }
         }
         match found.len() > MAX_BINS {
-            true => Err(FileError::new(
-                path,
-                format!(
-                    "column `{}` has more than {MAX_BINS} different values (expected tomographic bins). Try: --tomography NAME",
+            true => {
+                let message = format!(
+                    "column `{}` has more than {MAX_BINS} different values (expected tomographic bins)",
                     self.tomography.as_deref().unwrap_or_default()
-                ),
-            )),
+                );
+                Err(FileError::new(path, message).hint("--tomography NAME"))
+            }
             false => Ok(()),
         }
     }
