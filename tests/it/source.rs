@@ -157,6 +157,47 @@ fn unsafe_code_is_where_it_is_known() {
     assert_eq!(found, [true; KNOWN.len()], "{KNOWN:?}");
 }
 
+// Files, or folders of files, with hints inside of texts: lines of tables, reports and lists, which have no fields, and texts of
+// `MeasureError::Shape` and of a configuration whose crate is below the one that joins.
+const HINTS_IN_TEXTS: [&str; 16] = [
+    "crates/catalogue/src/columns.rs",
+    "crates/catalogue/src/sheared_files.rs",
+    "crates/catalogue/src/source.rs",
+    "crates/challenge/src/entry.rs",
+    "crates/challenge/src/ranking.rs",
+    "crates/dataset/src/files.rs",
+    "crates/detection/src/detector.rs",
+    "crates/files/src/lib.rs",
+    "crates/measure/src/psf/oversampled.rs",
+    "crates/pipeline/src/detect.rs",
+    "crates/pipeline/src/gather.rs",
+    "crates/pipeline/src/wcs/header.rs",
+    "crates/quantities/src/lib.rs",
+    "crates/results/src/submit/check.rs",
+    "crates/results/src/views/",
+    "submissions/src/error.rs",
+];
+
+#[test]
+fn hints_are_fields_of_errors() {
+    let mut found = [false; HINTS_IN_TEXTS.len()];
+    let libraries = files(&["crates", "scoring", "submissions"]);
+    for path in libraries.iter().filter(|path| !path.ends_with("tests.rs")) {
+        let name = path.display().to_string();
+        let text = fs::read_to_string(path).unwrap();
+        let code = text.split("#[cfg(test)]\nmod tests").next().unwrap();
+        let mut lines = code.lines().map(|line| line.split("//").next().unwrap());
+        if lines.any(|line| line.contains("Try: ")) {
+            let place = HINTS_IN_TEXTS
+                .iter()
+                .position(|known| name.starts_with(known));
+            let place = place.unwrap_or_else(|| panic!("{name}: a hint belongs to `hint`"));
+            found[place] = true;
+        }
+    }
+    assert_eq!(found, [true; HINTS_IN_TEXTS.len()], "{HINTS_IN_TEXTS:?}");
+}
+
 #[test]
 fn files_of_a_crate_use_each_other_without_circles() {
     let crates = levels().into_keys().map(|folder| match folder.as_str() {
