@@ -145,6 +145,11 @@ impl Keys {
                 "{named} of the WCS are not used, because the header states the distortion by SIP, too"
             ));
         }
+        if all("PV") && self.text("CTYPE1").contains("SIN") {
+            return Some(format!(
+                "{named} of the WCS are not used (found a slant SIN projection, as of the NCP of radio astronomy; expected SIN without parameters), which moves positions by arcseconds far from the centre. Try: resample to TAN"
+            ));
+        }
         if all("PV") {
             return Some(format!(
                 "{named} of the WCS are not used, because its projection has no such parameters (found {}, expected TPV for distortions of SCAMP). Try: {} for both CTYPE if they are such distortions",
