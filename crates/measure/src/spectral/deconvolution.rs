@@ -122,7 +122,7 @@ pub struct Spectral {
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the stamp that
-/// [`Spectral::products`] reads, and the PSF on pixels of another shape.
+/// `Spectral::products` reads, and the PSF on pixels of another shape.
 #[derive(Debug, Clone)]
 pub struct SpectralScratch {
     pub(super) of_stamp: TransformScratch,
