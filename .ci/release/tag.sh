@@ -14,7 +14,13 @@ published=(-p shearq-quantities -p shearq-submissions -p shearq-bias -p shearq-s
 [ -z "$(git status --porcelain)" ] || fail "uncommitted changes. Try: git stash"
 git rev-parse -q --verify "refs/tags/v$version" > /dev/null && fail "the tag v$version exists. Try: a new version in Cargo.toml"
 grep -q "^version: $version\$" CITATION.cff || fail "CITATION.cff: expected version: $version"
+grep -q "^  version: \"$version\"\$" packaging/conda-forge/recipe.yaml || fail "packaging/conda-forge/recipe.yaml: expected version: \"$version\""
 grep -q "^## .*$version" CHANGELOG.md || fail "CHANGELOG.md: expected a section of $version"
+# What README, documents and packages say before a release. A rehearsal does not mind.
+if [ "${2:-}" = --tag ]; then
+    ! grep -nE "^Version .* not released|^## $version \(not released\)|not published yet|not public yet" README.md CHANGELOG.md CONTRIBUTING.md docs/install.md ||
+        fail "the lines above are of the time before the release. Try: new lines, and a commit"
+fi
 
 bash .ci/run
 cargo test --release -- --ignored
