@@ -141,6 +141,23 @@ def test_tables_of_other_packages_keep_every_bit(two, tmp_path):
             assert same_bits(back, a) and back.attrs == a.attrs, ending
 
 
+@pytest.mark.parametrize("package", ["astropy", "pandas", "polars"])
+def test_packages_that_are_missing_are_named_with_a_remedy(two, package, tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    calls = [getattr(two[0], f"to_{package}")]
+    if package == "astropy":
+        calls += [
+            lambda: two[0].write(tmp_path / "c.ecsv"),
+            lambda: shearq.from_meds(tmp_path / "c.meds", coadd="skip"),
+            lambda: shearq.from_exposure(str(tmp_path / "c.fits"), [50.0], [50.0]),
+        ]
+    for call in calls:
+        with pytest.raises(ModuleNotFoundError, match=f"needs {package}. Try: pip install {package}"):
+            call()
+
+
 def test_files_of_the_command_line_and_of_python_are_the_same(two, command, tmp_path):
     pandas = pytest.importorskip("pandas", reason="metadata are read by pandas")
     pytest.importorskip("pyarrow", reason="pandas reads Parquet by pyarrow")

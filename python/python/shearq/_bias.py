@@ -12,7 +12,7 @@ import numpy as np
 from . import _display, _hdf5, _shearq
 from ._arrays import shown
 from ._results import Result, origin, write
-from ._tables import _EXACT, is_missing, named_columns, narrowed
+from ._tables import _EXACT, is_missing, library, named_columns, narrowed
 
 Design = Literal["single", "pairs", "shears", "fields", "galaxies", "rotated"]
 Bins = Union[str, tuple[str, Union[int, Sequence[float]]]]
@@ -101,9 +101,7 @@ class Bias(Result):
 
     def to_frame(self) -> Any:
         """The rows as a pandas frame."""
-        import pandas
-
-        return pandas.DataFrame(self.rows)
+        return library("pandas", "to_frame").DataFrame(self.rows)
 
     def plot(self, quantity: Literal["m", "c"] = "m", limit: float | None = None, ax: Any = None) -> Any:
         """Plots m or c of both components in bins with error bars, and a band of ±limit. Needs matplotlib.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._arrays import double, shown, whole
+from ._tables import library
 
 # Planes of masks whose pixels have no light of the sky: those of afw's exposures and coadds, and their names in lsst.images.
 _PLANES = (
@@ -72,16 +73,14 @@ def _of_images(exposure: Any) -> _Parts:
 
 def _of_file(path: str) -> _Parts:
     """Of a FITS file with images called IMAGE, MASK and VARIANCE, as afw and lsst.images write them. Its PSF is not read."""
-    from astropy.io import fits
-    from astropy.wcs import WCS
-
+    fits, celestial = (library(name, "from_exposure of a file") for name in ("astropy.io.fits", "astropy.wcs"))
     with fits.open(path) as hdus:
         absent = [name for name in ("IMAGE", "MASK", "VARIANCE") if name not in hdus]
         if absent:
             raise ValueError(f"{path}: no image is called {', '.join(absent)}; expected IMAGE, MASK and VARIANCE")
         image, mask, variance = (np.array(hdus[name].data) for name in ("IMAGE", "MASK", "VARIANCE"))
         header, of_mask = hdus["IMAGE"].header, hdus["MASK"].header
-        wcs = WCS(header)
+        wcs = celestial.WCS(header)
     # afw states bits, lsst.images masks.
     bits = {key[3:]: 1 << int(value) for key, value in of_mask.items() if key.startswith("MP_")}
     bits |= {str(value): int(of_mask[f"MSKM{key[4:]}"]) for key, value in of_mask.items() if key.startswith("MSKN")}

@@ -39,9 +39,8 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
         catalogue = _tables.from_table(Catalogue, np.load(file))
         return catalogue
     if format == "ecsv":
-        from astropy.table import Table
-
-        catalogue = _tables.from_table(Catalogue, Table.read(file, format="ascii.ecsv"))
+        table = _tables.library("astropy.table", f"{file}: a file of ECSV").Table.read(file, format="ascii.ecsv")
+        catalogue = _tables.from_table(Catalogue, table)
         return catalogue
     keys = [*_schema.KEYS, *_schema.OTHER_KEYS, _schema.STAR_KEY, _schema.PSF_KEY]
     columns, metadata = _shearq.read_table(str(file), format, keys)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._arrays import whole
+from ._tables import library
 from .adapters import _epochs, _resized
 
 MedsPsfs = Union[Callable[[Any, int, int], Any], Sequence[Any], Mapping[int, Any]]
@@ -21,8 +22,7 @@ class _MedsFile:
     """A MEDS file with the methods of ``meds.MEDS`` that are used here, read by astropy."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        from astropy.io import fits
-
+        fits = library("astropy.io.fits", "from_meds")
         self._path = path
         try:
             self._fits = fits.open(path, memmap=True, disable_image_compression=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from ._arrays import degrees, double, flat, real, shown, whole
 from ._catalogue import Catalogue, raw
 from ._results import Result, origin
 from ._submissions import submissions
+from ._tables import library
 from ._warn import warn
 
 # Pixels a side of a cell where no positions tell otherwise; it then changes no metric.
@@ -517,11 +517,11 @@ def _difference(metric: str, first: Score | None, scored: Score) -> tuple[float,
 def _frame(name: str | None) -> Any:
     if name not in (None, "pandas", "polars", "list"):
         raise ValueError(f"frame: found {name!r}; expected 'pandas', 'polars' or 'list'")
-    for library in ("pandas", "polars") if name is None else (name,):
-        if library == "list":
+    for package in ("pandas", "polars") if name is None else (name,):
+        if package == "list":
             break
         try:
-            return importlib.import_module(library).DataFrame
+            return library(package, f"frame={package!r}").DataFrame
         except ImportError:
             if name is not None:
                 raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import importlib
 import math
 import os
 import pathlib
@@ -27,16 +28,25 @@ _EXACT = 2**53
 _FORMATS = {".parquet": "parquet", ".pq": "parquet", ".fits": "fits", ".fit": "fits", ".ecsv": "ecsv", ".npy": "npy"}
 
 
+def library(name: str, task: str) -> Any:
+    """The module of a package, or an ImportError that says what needs it and how to get it."""
+    package = name.partition(".")[0]
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != package:
+            raise
+        raise ModuleNotFoundError(f"{task} needs {package}. Try: pip install {package}", name=package) from None
+
+
 def _columns(catalogue: Any) -> dict[str, Any]:
     """Columns by name, each in memory of its own."""
     return {name: np.ascontiguousarray(catalogue[name]) for name in catalogue.dtype.names or ()}
 
 
 def to_astropy(catalogue: Any) -> astropy.table.Table:
-    from astropy.table import Table
-
     meta = {key: _schema.in_header(value) for key, value in _schema.to_keys(catalogue.attrs).items()}
-    table = Table(_columns(catalogue), meta=meta)
+    table: astropy.table.Table = library("astropy.table", "to_astropy").Table(_columns(catalogue), meta=meta)
     units = dict(_schema.UNITS)
     # The linear method has a standard deviation there, and the network a sum of moments.
     if "snr" in table.colnames or "iterations" in table.colnames:
@@ -48,17 +58,14 @@ def to_astropy(catalogue: Any) -> astropy.table.Table:
 
 
 def to_pandas(catalogue: Any) -> pandas.DataFrame:
-    import pandas
-
-    frame = pandas.DataFrame(_columns(catalogue))
+    frame: pandas.DataFrame = library("pandas", "to_pandas").DataFrame(_columns(catalogue))
     frame.attrs.update(catalogue.attrs)
     return frame
 
 
 def to_polars(catalogue: Any) -> polars.DataFrame:
-    import polars
-
-    return polars.DataFrame(_columns(catalogue))
+    frame: polars.DataFrame = library("polars", "to_polars").DataFrame(_columns(catalogue))
+    return frame
 
 
 def named_columns(table: Any) -> list[tuple[str, Any]]:
