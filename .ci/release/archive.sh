@@ -29,7 +29,7 @@ tree=$stage/$name
 mkdir -p "$tree/completions"
 install -m 755 "$binary" "$tree/shearq"
 strip "$tree/shearq"
-cp README.md CHANGELOG.md CITATION.cff LICENSE-MIT LICENSE-APACHE "$tree"
+cp README.md CHANGELOG.md CONTRIBUTING.md CITATION.cff LICENSE-MIT LICENSE-APACHE "$tree"
 cp -r docs "$tree/docs"
 python3 .ci/release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
 for shell in bash zsh fish; do
@@ -56,6 +56,7 @@ made=("$name.tar.gz")
 if command -v dpkg-deb > /dev/null; then
     root=$stage/debian
     doc=$root/usr/share/doc/shearq
+    maintainer="the authors of shearq <shearq@users.noreply.github.com>"
     share=$root/usr/share
     mkdir -p "$root/DEBIAN" "$root/usr/bin" "$share/man/man1" "$doc"
     mkdir -p "$share/bash-completion/completions" "$share/zsh/vendor-completions" "$share/fish/vendor_completions.d"
@@ -65,14 +66,29 @@ if command -v dpkg-deb > /dev/null; then
     cp "$tree/completions/shearq.fish" "$share/fish/vendor_completions.d"
     cp "$tree"/man/*.1 "$share/man/man1"
     gzip -n -9 "$share"/man/man1/*.1
-    cp -r README.md CHANGELOG.md docs "$doc"
-    cat LICENSE-MIT "$tree/LICENCES-OF-DEPENDENCIES.txt" > "$doc/copyright"
+    cp -r README.md CHANGELOG.md CONTRIBUTING.md CITATION.cff docs "$doc"
+    gzip -n -9 > "$doc/changelog.gz" << CHANGELOG
+shearq ($version) unstable; urgency=medium
+
+  * Changes are in CHANGELOG.md beside this file.
+
+ -- $maintainer  $(LC_ALL=C date -u -R -d "@$SOURCE_DATE_EPOCH")
+CHANGELOG
+    {
+        echo "shearq, https://github.com/shearq/shearq, is licensed under either of MIT and Apache-2.0, at your option."
+        echo "The text of Apache-2.0 is in /usr/share/common-licenses/Apache-2.0, that of MIT is:"
+        echo
+        cat LICENSE-MIT
+        echo
+        cat "$tree/LICENCES-OF-DEPENDENCIES.txt"
+    } > "$doc/copyright"
     cat > "$root/DEBIAN/control" << CONTROL
 Package: shearq
 Version: $version
 Architecture: $(dpkg --print-architecture)
-Maintainer: the authors of shearq <shearq@users.noreply.github.com>
+Maintainer: $maintainer
 Depends: libc6 (>= 2.17)
+Installed-Size: $(du -sk --apparent-size "$root/usr" | cut -f1)
 Section: science
 Priority: optional
 Homepage: https://github.com/shearq/shearq
@@ -81,6 +97,7 @@ Description: m and c of weak-lensing shear catalogues, galaxy shapes, scores
  program, measures galaxy shapes with their shear responses, scores methods
  as the GREAT challenges did, and runs challenges.
 CONTROL
+    (cd "$root" && find usr -type f | LC_ALL=C sort | xargs md5sum > DEBIAN/md5sums)
     find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
     package=shearq_${version}_$(dpkg --print-architecture).deb
     dpkg-deb --root-owner-group --build "$root" "$out/$package" > /dev/null
