@@ -127,7 +127,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let report = out.join("report.html");
     pages::save(&report, "Quickstart (simulated data)", sections, made_by)?;
     tell(format_args!(
-        "\nfigure: {}\nreport with all metrics and plots: {}\nNext: m and c of your catalogue (docs/tutorial-bias.md),\nor shapes of your own galaxies (docs/own-images.md).",
+        "\nfigure: {}\nreport with all metrics and plots: {}\nNext: m and c of your catalogue (shearq bias --help),\nor shapes of your own galaxies (shearq measure --help).",
         picture.display(),
         report.display()
     ));
