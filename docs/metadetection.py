@@ -32,15 +32,12 @@ class Shearer:
         star[: 2 * half, : 2 * half] = psf / psf.sum()
         # The PSF of `simulate` has its centre between the pixels half - 1 and half.
         self.transfer = fft.rfft2(star) * np.exp(1j * self.k.sum(0) * (half - 0.5))
-        self.power = np.abs(fft.fftshift(fft.fft2(star)))
+        self.modulus = np.abs(fft.fftshift(fft.fft2(star)))
         square = (self.k**2).sum(0)
         self.variance = -2 * np.log(3e-3) / square[np.abs(self.transfer) < 0.01].min() * 1.02**2
 
-    def target(self, k):
-        return np.exp(-0.5 * self.variance * (k**2).sum(0))
-
     def image(self, image, g):
-        # Beyond 10⁻⁴, the Gaussian has less than 10⁻³ of the PSF's power.
+        # Where the PSF's transform is below 10⁻⁴, the Gaussian's is a thousandth of it.
         known = np.abs(self.transfer) > 1e-4
         return self.sheared(np.divide(fft.rfft2(image), self.transfer, out=np.zeros_like(self.transfer), where=known), g)
 
@@ -50,8 +47,8 @@ class Shearer:
         matrix = shear_matrix(g)
         turned = matrix @ [[0, 1], [-1, 0]] @ np.linalg.inv(matrix)
         places = np.tensordot(turned, self.k, 1) * self.side / (2 * np.pi) + self.side // 2
-        power = ndimage.map_coordinates(self.power, places, order=1, mode="nearest")
-        return self.sheared(np.divide(fft.rfft2(noise), power, out=np.zeros_like(self.transfer), where=power > 1e-4), g)
+        modulus = ndimage.map_coordinates(self.modulus, places, order=1, mode="nearest")
+        return self.sheared(np.divide(fft.rfft2(noise), modulus, out=np.zeros_like(self.transfer), where=modulus > 1e-4), g)
 
     def sheared(self, deconvolved, g):
         inverse = np.linalg.inv(shear_matrix(g))
@@ -59,7 +56,7 @@ class Shearer:
         square = (np.tensordot(inverse, self.k, 1) ** 2).sum(0)
         smooth = fft.irfft2(deconvolved * np.exp(-0.5 * self.variance * square), s=(self.side, self.side))
         centre = np.full(2, (self.side - 1) / 2)
-        return ndimage.affine_transform(smooth, inverse, centre - inverse @ centre, order=5, mode="wrap")
+        return ndimage.affine_transform(smooth, inverse, centre - inverse @ centre, order=5, mode="grid-wrap")
 
 
 def shear_matrix(g):
@@ -103,8 +100,9 @@ for path in sorted(SCENES.glob("**/scene-*.fits"), key=lambda path: (path.name, 
     if out.exists():
         continue
     image, psf = (fits.getdata(name).astype(float) for name in (path, path.with_name("psf.fits")))
-    # The same noise for all versions of a scene, so that it cancels where that of the exposure does.
-    noise = np.random.default_rng(int(path.stem[-3:])).normal(size=image.shape)
+    # The same noise for all versions of a scene, and its opposite where the exposure has the opposite noise.
+    noise = np.random.default_rng(int(path.stem.split("-")[1])).normal(size=image.shape)
+    noise *= -1 if "noise" in path.parent.name else 1
     shearer, rows = Shearer(psf, len(image)), []
     for name, g in STEPS.items():
         added = shearer.noise(noise, g)

@@ -375,6 +375,11 @@ def test_headers_state_sizes_of_pixels(tmp_path):
     other = fits.PrimaryHDU(native, fits.Header({"SECPIX": 0.25}))
     with pytest.warns(shearq.DataWarning, match="different pixel scales .found 0.25, expected 0.2 "):
         shearq.measure(stamps, other, noise=1.0)
+    # A scale that `wcs` states, on which OVERSAMP has no part.
+    contradicted = fits.PrimaryHDU(native, fits.Header({"OVERSAMP": 2, "PIXELSCL": 0.2}))
+    wcs = np.diag([0.2, 0.2])
+    found = shearq.measure(image.stamps, contradicted, noise=1.0, wcs=wcs)
+    np.testing.assert_array_equal(found["e1"], shearq.measure(image.stamps, native, noise=1.0, wcs=wcs)["e1"])
     # OVERSAMP that the scales contradict.
     for scale in (0.2, 0.3):
         contradicted = fits.PrimaryHDU(native, fits.Header({"OVERSAMP": 4, "PIXELSCL": scale}))

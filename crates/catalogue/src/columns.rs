@@ -878,7 +878,8 @@ fn chosen_pair<'f>(
             Some(given) => is_of_method(&given),
             None => {
                 let responses = found.iter().map(String::as_str);
-                let mut responses = responses.filter(|own| is_response(Role::R11, own));
+                let mut responses = responses
+                    .filter(|own| is_response(Role::R11, own) && is_of_whole_matrix(found, own));
                 responses.any(|own| is_of_method(&own)) || sheared_column(found, e1, 1).is_some()
             }
         }
@@ -1749,6 +1750,9 @@ mod tests {
         }
         let metacal = "e1 e2 mcal_e1 mcal_e2 mcal_e1_1p mcal_e1_1m mcal_e2_2p mcal_e2_2m";
         assert_eq!(found(metacal, &[]).unwrap().of(Role::E1), Some("mcal_e1"));
+        // A vector of radii is no response of e1.
+        let radii = "e1 e2 mcal_g_1 mcal_g_2 mcal_R11 mcal_R22 r[0] r[1] r[2]";
+        assert_eq!(found(radii, &[]).unwrap().of(Role::E1), Some("mcal_g_1"));
         let mixed = "mcal_g_1 mcal_g_2 mcal_R11 R11 R22";
         assert!(found(mixed, &[]).unwrap_err().contains("none for R22"));
         let own = found("fpfs_e1 fpfs_e2 w fpfs_w", &[]).unwrap();

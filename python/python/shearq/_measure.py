@@ -233,7 +233,7 @@ def measure(
         _doubt_mask(mask)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
-    if psf_oversampling is not None:
+    if psf_oversampling not in (None, 1):
         given["psf_oversampling"] = psf_oversampling
     for name, value in given.items():
         if value is not None:
@@ -367,6 +367,9 @@ def _pixels(
     psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel, fine)
     if fine and _galsim._many(psf, _galsim._is_profile) is not None:
         raise ValueError(_psf_models.FINE_PROFILE)
+    images = _galsim._many(stamps, _galsim._is_image) if fine and wcs is None else None
+    if images is not None:
+        _galsim._common("stamps", images)
     # Models have drawn their PSFs with the pixel.
     of_profiles = None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
     stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and not fine, pixel=of_profiles, wcs=wcs, x=x, y=y)

@@ -118,15 +118,14 @@ def narrowed(table: Any, needed: Callable[[Sequence[str]], Sequence[str]] = list
     elif hasattr(table, "num_columns") and hasattr(table, "schema"):
         (names, numbers), choose = _schema_of(zip(table.schema.names, table.schema.types)), table.select
     elif hasattr(table, "__arrow_c_stream__") and not hasattr(type(table), "__array__"):
-        import pyarrow
-
+        pyarrow = library("pyarrow", "this table")
         stream = pyarrow.RecordBatchReader.from_stream(table)
         # Batch by batch: of a relation of duckdb with 66 columns and 2 million rows, 1.1 GB instead of 3.0 GB.
         (names, numbers), choose = _schema_of(zip(stream.schema.names, stream.schema.types)), partial(_selected, stream)
     else:
         return table, []
-    # The numbers of a vector have names of their own, and vectors and texts are kept.
-    known = names + [f"{name}[{place}]" for name in names if name not in numbers for place in range(2)]
+    # The numbers of a vector, such as the four of R, have names of their own, and vectors and texts are kept.
+    known = names + [f"{name}[{place}]" for name in names if name not in numbers for place in range(4)]
     kept = set(needed(known))
     unread = [name for name in numbers if name not in kept]
     return choose([name for name in names if name not in unread]), unread
