@@ -96,9 +96,14 @@ impl FileError {
 
     /// The message with the hint, without the path.
     pub fn text(&self) -> String {
-        let text = self.message.clone() + &tried(self.hint.as_ref());
         // A question has its mark.
-        text.replace("?. Try: ", "? Try: ")
+        let message = self.message.as_str();
+        let end = tried(self.hint.as_ref());
+        message.to_owned()
+            + end
+                .strip_prefix('.')
+                .filter(|_| message.ends_with('?'))
+                .unwrap_or(&end)
     }
 
     /// The same about another path, such as that of an archive for a file in it.
