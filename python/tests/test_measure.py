@@ -380,6 +380,10 @@ def test_headers_state_sizes_of_pixels(tmp_path):
     wcs = np.diag([0.2, 0.2])
     found = shearq.measure(image.stamps, contradicted, noise=1.0, wcs=wcs)
     np.testing.assert_array_equal(found["e1"], shearq.measure(image.stamps, native, noise=1.0, wcs=wcs)["e1"])
+    galsim = pytest.importorskip("galsim")
+    stamps_of_galsim = [galsim.Image(stamp, wcs=galsim.JacobianWCS(0.2, 0, 0, 0.2)) for stamp in image.stamps]
+    found = shearq.measure(stamps_of_galsim, contradicted, noise=1.0)
+    np.testing.assert_array_equal(found["e1"], shearq.measure(image.stamps, native, noise=1.0)["e1"])
     # OVERSAMP that the scales contradict.
     for scale in (0.2, 0.3):
         contradicted = fits.PrimaryHDU(native, fits.Header({"OVERSAMP": 4, "PIXELSCL": scale}))

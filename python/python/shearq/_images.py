@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from . import _shearq
+from . import _galsim, _shearq
 from ._arrays import shown
 from ._warn import DataWarning, warn
 
@@ -82,9 +82,8 @@ def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float
 def _scale(stamps: Any, wcs: Any) -> float | None:
     """The pixel scale of a given Jacobian, or of images of GalSim."""
     if wcs is None:
-        first = stamps[0] if isinstance(stamps, (list, tuple)) and stamps else stamps
-        scale = getattr(getattr(first, "wcs", None), "scale", None)
-        return None if scale is None else float(scale)
+        images = _galsim._many(stamps, _galsim._is_image)
+        return None if images is None else _galsim._common("stamps", images)
     matrix = np.asarray(wcs)
     if matrix.dtype.kind not in "fiu" or matrix.shape[-2:] != (2, 2):
         return None
@@ -95,7 +94,9 @@ def opened(stamps: Any, psf: Any, wcs: Any, oversampling: int | None) -> tuple[A
     """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS and oversampling that are not given."""
     stamps, own, size = _opened("stamps", stamps, wcs is not None)
     psf, of_psf, psf_size = _opened("psf", psf, wcs is not None)
-    stated, fault = _shearq.stated_oversampling(psf_size, (_scale(stamps, wcs) or size[0], None))
+    stated, fault = None, None
+    if psf_size != _NO_SIZE:
+        stated, fault = _shearq.stated_oversampling(psf_size, (_scale(stamps, wcs) or size[0], None))
     if oversampling is None and stated is not None:
         oversampling = stated
         message = f"psf: has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP of its header states. psf_oversampling=1 ignores that"
