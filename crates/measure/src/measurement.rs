@@ -400,6 +400,7 @@ pub(crate) const FLUX: usize = 0; // Place of the flux in the arrays of a coupli
 pub(crate) const SIZE: usize = 1; // Place of the size.
 pub(crate) const RING: usize = 2; // Place of the light of the ring.
 pub(crate) const VARIABLES: usize = 3;
+pub(crate) const QUANTITIES: usize = 2 + VARIABLES; // The components of the ellipticity come before the variables.
 
 /// Mean products of the changes by noise of the ellipticity and of three variables: flux, size and light of the ring, in this order.
 ///

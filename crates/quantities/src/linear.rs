@@ -9,6 +9,8 @@
 //! So few modes are kept that sums over pixels, modes or lags along an axis take less time as
 //! dense products than as fast transforms.
 
+use std::ops::Index;
+
 use multiversion::multiversion;
 
 /// Solves the first `count` of N equations with a symmetric positive matrix by Cholesky's decomposition.
@@ -124,6 +126,46 @@ pub fn inverse(matrix: Matrix2) -> Matrix2 {
 pub fn solve(matrix: Matrix2, to: [f64; 2]) -> [f64; 2] {
     let [[a, b], [c, d]] = matrix;
     apply([[d, -b], [-c, a]], to).map(|value| value / determinant(matrix))
+}
+
+/// A symmetric matrix, such as the mean products of N quantities with each other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Symmetric<const N: usize, T = f64>([[T; N]; N]);
+
+impl<const N: usize, T: Copy + Default> Symmetric<N, T> {
+    /// Takes `of(a, b)` for each pair a ≤ b, once.
+    pub fn from_fn(of: impl Fn(usize, usize) -> T) -> Self {
+        let mut values = [[T::default(); N]; N];
+        for (a, b) in (0..N).flat_map(|a| (a..N).map(move |b| (a, b))) {
+            let value = of(a, b);
+            (values[a][b], values[b][a]) = (value, value);
+        }
+        Symmetric(values)
+    }
+}
+
+impl<const N: usize> Symmetric<N> {
+    /// J C Jᵀ: the mean products of quantities that change by `rows` J times the changes of these.
+    #[must_use]
+    pub fn transformed<const M: usize>(&self, rows: &[[f64; N]; M]) -> Symmetric<M> {
+        let dot = |a: &[f64; N], b: &[f64; N]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let right = rows.map(|row| self.0.map(|of| dot(&of, &row)));
+        Symmetric::from_fn(|a, b| dot(&rows[a], &right[b]))
+    }
+}
+
+impl<const N: usize, T: Copy + Default> Default for Symmetric<N, T> {
+    fn default() -> Self {
+        Symmetric([[T::default(); N]; N])
+    }
+}
+
+impl<const N: usize, T> Index<[usize; 2]> for Symmetric<N, T> {
+    type Output = T;
+
+    fn index(&self, [a, b]: [usize; 2]) -> &T {
+        &self.0[a][b]
+    }
 }
 
 /// Columns that are summed side by side.
@@ -254,6 +296,18 @@ mod tests {
             // A few roundings of numbers of order one.
             assert!((found - expected).abs() < 1e-14, "{found} {expected}");
         }
+    }
+
+    #[test]
+    fn mean_products_of_sums_follow_from_those_of_their_terms() {
+        let of = Symmetric::from_fn(|a, b| MATRIX[a][b]);
+        let found = of.transformed(&[SOLUTION, [0.0, 2.0, 0.0]]);
+        let own = product(&MATRIX);
+        let expected: f64 = own.iter().zip(SOLUTION).map(|(a, b)| a * b).sum();
+        close(
+            &[found[[0, 0]], found[[0, 1]], found[[1, 0]], found[[1, 1]]],
+            &[expected, 2.0 * own[1], 2.0 * own[1], 12.0],
+        );
     }
 
     #[test]

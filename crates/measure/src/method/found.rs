@@ -1,11 +1,12 @@
 //! What a method found on a stamp becomes the reported ellipticity, with its response, couplings and sheared catalogues.
 
+use shearq_quantities::linear::Symmetric;
 use shearq_quantities::{Distortion, Spin2};
 use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use crate::measurement::{
-    Coupling, Descent, Flag, Flags, Measurement, Observables, ResponseMatrix, ShearedCatalogues,
-    isotropic,
+    Coupling, Descent, FLUX, Flag, Flags, Measurement, Observables, QUANTITIES, RING,
+    ResponseMatrix, SIZE, ShearedCatalogues, VARIABLES, isotropic,
 };
 use crate::selection::{Matrix, ShearSettings, sheared};
 use crate::shape::Size;
@@ -38,118 +39,66 @@ pub(super) struct FoundObservables {
     pub(super) sheared: Option<ShearSettings>,
 }
 
-/// Mean products of the changes of two quantities by noise, and mean second derivatives. T is the mean square from which the
-/// size follows.
+/// Mean products of the changes of quantities by noise, and mean second derivatives.
 #[derive(Default)]
 pub(super) struct NoiseMeans {
-    /// e₁ and e₁, e₁ and e₂, e₂ and e₂, before saturation.
-    pub(super) e_e: [f64; 3],
-    /// e₁ and T, e₂ and T.
-    pub(super) e_square: [f64; 2],
-    pub(super) e_flux: [f64; 2],
-    pub(super) square_square: f64,
-    pub(super) square_flux: f64,
-    pub(super) flux_flux: f64,
-    pub(super) ring_e: [f64; 2],
-    pub(super) ring_square: f64,
-    pub(super) ring_flux: f64,
-    pub(super) ring_ring: f64,
-    /// Second derivatives of e₁ and e₂, and of T.
-    pub(super) e_curvature: [f64; 2],
-    pub(super) square_curvature: f64,
+    /// Of e₁ and e₂ before saturation, the flux, the mean square T from which the size follows, and the ring.
+    pub(super) products: Symmetric<QUANTITIES>,
+    /// Second derivatives of e₁, e₂ and T.
+    pub(super) curvature: [f64; 3],
 }
 
 impl NoiseChanges<NoiseMeans> {
     /// Turns both components of e, and both components of the shear that changes the noise.
     fn turn(&mut self, by: &Spin2) {
+        let [first, second] = &self.sheared;
+        let sheared = [0, 1].map(|k| NoiseMeans {
+            products: Symmetric::from_fn(|a, b| {
+                by.turn([first.products[[a, b]], second.products[[a, b]]])[k]
+            }),
+            curvature: [0, 1, 2].map(|a| by.turn([first.curvature[a], second.curvature[a]])[k]),
+        });
+        self.sheared = sheared;
         let [first, second] = &mut self.sheared;
-        let curvature = [0, 1].map(|i| [first.e_curvature[i], second.e_curvature[i]]);
-        let [[first1, second1], [first2, second2]] = by.turn_response(curvature);
-        for (first, second) in first.values_mut().into_iter().zip(second.values_mut()) {
-            [*first, *second] = by.turn([*first, *second]);
+        for means in [first, second, &mut self.turned, &mut self.plain] {
+            let [e1, e2, square] = means.curvature;
+            let [e1, e2] = by.turn([e1, e2]);
+            means.curvature = [e1, e2, square];
+            let columns = [[1.0, 0.0], [0.0, 1.0]].map(|unit| by.turn(unit));
+            let matrix = [0, 1].map(|i| columns.map(|column| column[i]));
+            means.products = means
+                .products
+                .transformed(&beside(matrix, [1.0; VARIABLES]));
         }
-        for means in [&mut *first, &mut *second, &mut self.turned, &mut self.plain] {
-            means.turn(by);
-        }
-        first.e_curvature = [first1, first2];
-        second.e_curvature = [second1, second2];
     }
 }
 
+/// How all quantities change with the ellipticity, by a matrix, and with the variables, each by a factor.
+fn beside(
+    ellipticity: ResponseMatrix,
+    variables: [f64; VARIABLES],
+) -> [[f64; QUANTITIES]; QUANTITIES] {
+    let mut rows = [[0.0; QUANTITIES]; QUANTITIES];
+    for (row, of) in rows.iter_mut().zip(ellipticity) {
+        row[..2].copy_from_slice(&of);
+    }
+    for (k, factor) in variables.into_iter().enumerate() {
+        rows[2 + k][2 + k] = factor;
+    }
+    rows
+}
+
 impl NoiseMeans {
-    /// Turns both components of e.
-    fn turn(&mut self, by: &Spin2) {
-        let [e11, e12, e22] = self.e_e;
-        let [[e11, e12], [_, e22]] = by.turn_response([[e11, e12], [e12, e22]]);
-        self.e_e = [e11, e12, e22];
-        for vector in [
-            &mut self.e_square,
-            &mut self.e_flux,
-            &mut self.ring_e,
-            &mut self.e_curvature,
-        ] {
-            *vector = by.turn(*vector);
-        }
-    }
-
-    /// All but the second derivatives of e, which turn with the shear as a matrix.
-    fn values_mut(&mut self) -> [&mut f64; 16] {
-        let NoiseMeans {
-            e_e: [e11, e12, e22],
-            e_square: [square1, square2],
-            e_flux: [flux1, flux2],
-            square_square,
-            square_flux,
-            flux_flux,
-            ring_e: [ring1, ring2],
-            ring_square,
-            ring_flux,
-            ring_ring,
-            e_curvature: _,
-            square_curvature,
-        } = self;
-        [
-            e11,
-            e12,
-            e22,
-            square1,
-            square2,
-            flux1,
-            flux2,
-            square_square,
-            square_flux,
-            flux_flux,
-            ring1,
-            ring2,
-            ring_square,
-            ring_flux,
-            ring_ring,
-            square_curvature,
-        ]
-    }
-
-    /// The products of e₁, e₂, T and the flux with each other.
-    fn matrix(&self) -> [[f64; 4]; 4] {
-        let [e11, e12, e22] = self.e_e;
-        let ([t1, t2], [f1, f2]) = (self.e_square, self.e_flux);
-        let (tt, tf, ff) = (self.square_square, self.square_flux, self.flux_flux);
-        [
-            [e11, e12, t1, f1],
-            [e12, e22, t2, f2],
-            [t1, t2, tt, tf],
-            [f1, f2, tf, ff],
-        ]
-    }
-
     /// Mean second derivative of the saturated ellipticity.
     fn curvature(&self, saturation: Saturation, e: [f64; 2]) -> [f64; 2] {
         // With H of `Saturation`, the second derivative by e_j and e_k is 2H′(e_i δ_jk + e_j δ_ik + e_k δ_ij) + 4H″ e_i e_j e_k.
         let [_, first, second] = saturation.factors(e);
-        let [p11, p12, p22] = self.e_e;
+        let [p11, p12, p22] = [[0, 0], [0, 1], [1, 1]].map(|pair| self.products[pair]);
         let along = [p11 * e[0] + p12 * e[1], p12 * e[0] + p22 * e[1]];
         let square = along[0] * e[0] + along[1] * e[1];
         // A change of e is like the response to one shear that changes both components.
-        let change = saturation.response(e, self.e_curvature.map(|mean| [mean; 2]));
+        let [first_mean, second_mean, _] = self.curvature;
+        let change = saturation.response(e, [[first_mean; 2], [second_mean; 2]]);
         [0, 1].map(|i| {
             let turned = e[i] * (p11 + p22) + 2.0 * along[i];
             change[i][i] + 2.0 * first * turned + 4.0 * second * e[i] * square
@@ -199,7 +148,8 @@ impl Found {
                 };
             }
         };
-        let observables = self.observables(saturation);
+        let noise = self.noise(saturation);
+        let observables = self.observables(noise.as_ref());
         let pair = observables.as_ref().zip(response);
         Measurement {
             e1: e[0],
@@ -207,10 +157,12 @@ impl Found {
             flags: Flags::NONE,
             // Sheared catalogues may be cut by e, and need all of R.
             response: response.map(|[[r11, _], [_, r22]]| isotropic(r11 + r22)),
-            e_variance: self.e_variance(saturation),
+            e_variance: noise
+                .as_ref()
+                .map_or([0.0; 2], |noise| [0, 1].map(|k| noise.plain[[k, k]])),
             observables,
             sheared: pair.and_then(|(observables, response)| {
-                self.sheared_catalogues(saturation, e, response, observables)
+                self.sheared_catalogues(noise.unwrap_or_default(), e, response, observables)
             }),
             ..measured
         }
@@ -237,20 +189,21 @@ impl Found {
         Ok((e, response))
     }
 
-    /// Variances of the saturated ellipticity by noise, of the galaxies that they are determined for.
-    fn e_variance(&self, saturation: Saturation) -> [f64; 2] {
-        let (Ok(e), Some(noise)) = (self.ellipticity, &self.noise_moments) else {
-            return [0.0; 2];
-        };
-        let [p11, p12, p22] = noise.plain.e_e;
-        saturation
-            .response(e, [[1.0, 0.0], [0.0, 1.0]])
-            .map(|[a, b]| a * a * p11 + 2.0 * a * b * p12 + b * b * p22)
+    /// Mean products of the changes by noise of the saturated ellipticity, flux, size and ring.
+    fn noise(&self, saturation: Saturation) -> Option<NoiseChanges<Symmetric<QUANTITIES>>> {
+        let (plain, found) = (self.ellipticity.ok()?, self.observables.as_ref()?);
+        let of_e = saturation.response(plain, [[1.0, 0.0], [0.0, 1.0]]);
+        let rows = beside(of_e, [1.0, found.size.slope, 1.0]);
+        let noise = self.noise_moments.as_ref()?;
+        Some(noise.map(|means| means.products.transformed(&rows)))
     }
 
-    /// Flux and size with their couplings to the saturated ellipticity.
-    fn observables(&self, saturation: Saturation) -> Option<Observables> {
-        let (plain, found) = (self.ellipticity.ok()?, self.observables.as_ref()?);
+    /// Flux and size with their couplings to the saturated ellipticity by `noise`.
+    fn observables(
+        &self,
+        noise: Option<&NoiseChanges<Symmetric<QUANTITIES>>>,
+    ) -> Option<Observables> {
+        let found = self.observables.as_ref()?;
         let Size {
             px: size,
             slope,
@@ -258,39 +211,29 @@ impl Found {
         } = found.size;
         let mut size_response = found.square_response.map(|response| slope * response);
         let mut coupling = Coupling::default();
-        if let Some(noise) = &self.noise_moments {
-            let jacobian = saturation.response(plain, [[1.0, 0.0], [0.0, 1.0]]);
-            let with_e = |products: [f64; 2]| {
-                jacobian.map(|row| row[0] * products[0] + row[1] * products[1])
-            };
-            // Of e1 and of e2 with flux, size and ring.
-            let with_variables = |means: &NoiseMeans| {
-                let flux = with_e(means.e_flux);
-                let size = with_e(means.e_square).map(|value| slope * value);
-                let ring = with_e(means.ring_e);
-                [0, 1].map(|k| [flux[k], size[k], ring[k]])
-            };
-            let among_variables = |means: &NoiseMeans| {
-                let size_flux = slope * means.square_flux;
-                let size_ring = slope * means.ring_square;
-                [
-                    [means.flux_flux, size_flux, means.ring_flux],
-                    [size_flux, slope * slope * means.square_square, size_ring],
-                    [means.ring_flux, size_ring, means.ring_ring],
-                ]
-            };
+        if let Some((noise, means)) = noise.zip(self.noise_moments.as_ref()) {
             // The size is not linear in T, and T not in the autocorrelation.
             let change_of_size = |means: &NoiseMeans| {
-                slope * means.square_curvature + curvature * means.square_square
+                let [.., of_square] = means.curvature;
+                slope * of_square + curvature * means.products[[2 + SIZE; 2]]
             };
-            for (k, means) in noise.sheared.iter().enumerate() {
-                coupling.sheared_e[k] = with_variables(means)[k];
-                size_response[k] -= change_of_size(means);
+            for (response, means) in size_response.iter_mut().zip(&means.sheared) {
+                *response -= change_of_size(means);
             }
-            coupling.sheared = noise.sheared.each_ref().map(among_variables);
-            coupling.turned_e = with_variables(&noise.turned);
-            coupling.turned = among_variables(&noise.turned);
-            coupling.turned_size = change_of_size(&noise.turned);
+            let variables: [usize; VARIABLES] = [FLUX, SIZE, RING];
+            let with_e = |products: &Symmetric<QUANTITIES>, k: usize| {
+                variables.map(|v| products[[k, 2 + v]])
+            };
+            let among = |products: &Symmetric<QUANTITIES>| {
+                variables.map(|a| variables.map(|b| products[[2 + a, 2 + b]]))
+            };
+            coupling = Coupling {
+                sheared_e: [0, 1].map(|k| with_e(&noise.sheared[k], k)),
+                sheared: noise.sheared.each_ref().map(among),
+                turned_e: [0, 1].map(|k| with_e(&noise.turned, k)),
+                turned: among(&noise.turned),
+                turned_size: change_of_size(&means.turned),
+            };
         }
         Some(Observables {
             flux: found.flux.value,
@@ -308,33 +251,15 @@ impl Found {
     /// effect of noise is unknown, it is not corrected.
     fn sheared_catalogues(
         &self,
-        saturation: Saturation,
+        noise: NoiseChanges<Symmetric<QUANTITIES>>,
         e: [f64; 2],
         response: ResponseMatrix,
         observables: &Observables,
     ) -> Option<ShearedCatalogues> {
-        let (plain, found) = (self.ellipticity.ok()?, self.observables.as_ref()?);
-        let settings = found.sheared?;
-        let [[a, b], [c, d]] = saturation.response(plain, [[1.0, 0.0], [0.0, 1.0]]);
-        // Rows are e1, e2, flux and size; columns e₁ and e₂ before saturation, T and flux.
-        let rows = [
-            [a, b, 0.0, 0.0],
-            [c, d, 0.0, 0.0],
-            [0.0, 0.0, 0.0, 1.0],
-            [0.0, 0.0, found.size.slope, 0.0],
-        ];
-        let matrix = |means: &NoiseMeans| -> Matrix {
-            let products = means.matrix();
-            let product = |a: usize, b: usize| -> f64 {
-                let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
-                terms
-                    .map(|[i, j]| rows[a][i] * rows[b][j] * products[i][j])
-                    .sum()
-            };
-            std::array::from_fn(|a| std::array::from_fn(|b| product(a, b)))
-        };
-        let noise = self.noise_moments.as_ref();
-        let noise = noise.map_or_else(NoiseChanges::default, |noise| noise.map(matrix));
+        let settings = self.observables.as_ref()?.sheared?;
+        let noise = noise.map(|products| -> Matrix {
+            std::array::from_fn(|a| std::array::from_fn(|b| products[[a, b]]))
+        });
         let Observables {
             flux_response,
             size_response,
@@ -419,15 +344,11 @@ mod tests {
     }
 
     fn means(next: &mut impl FnMut() -> f64) -> NoiseMeans {
-        let mut means = NoiseMeans {
-            e_curvature: [next(), next()],
-            ..NoiseMeans::default()
-        };
-        means
-            .values_mut()
-            .into_iter()
-            .for_each(|value| *value = next());
-        means
+        let values: [f64; 25] = std::array::from_fn(|_| next());
+        NoiseMeans {
+            products: Symmetric::from_fn(|a, b| values[5 * a + b]),
+            curvature: [next(), next(), next()],
+        }
     }
 
     fn found() -> Found {
@@ -518,13 +439,13 @@ mod tests {
         };
         // Of e_j and e_k.
         let bent = [0, 1].map(|j| [0, 1].map(|k| slope(&|e| column(e, j), k)));
-        let products = |[p11, p12, p22]: [f64; 3]| [[p11, p12], [p12, p22]];
+        let products = |means: &NoiseMeans| [0, 1].map(|j| [0, 1].map(|k| means.products[[j, k]]));
         let curvature = |means: &NoiseMeans| {
-            let p = products(means.e_e);
+            let p = products(means);
             [0, 1].map(|i| {
                 let pairs = (0..2).flat_map(|j| (0..2).map(move |k| [j, k]));
                 let linear = (0..2)
-                    .map(|j| columns[j][i] * means.e_curvature[j])
+                    .map(|j| columns[j][i] * means.curvature[j])
                     .sum::<f64>();
                 linear + pairs.map(|[j, k]| p[j][k] * bent[j][k][i]).sum::<f64>()
             })
@@ -532,8 +453,8 @@ mod tests {
         let noise = galaxy.noise_moments.as_ref().unwrap();
         let [own, turned] = [saturated(e), curvature(&noise.turned)];
         let ([e1, e2], response) = galaxy.saturated(saturation).unwrap();
-        let (r, p) = (galaxy.response.unwrap(), products(noise.plain.e_e));
-        let variance = galaxy.e_variance(saturation);
+        let (r, p) = (galaxy.response.unwrap(), products(&noise.plain));
+        let variance = galaxy.measurement(saturation, 1.0).e_variance;
         for i in 0..2 {
             // Truncation of differences.
             close([e1, e2][i], own[i] + 0.5 * turned[i], 1e-6);

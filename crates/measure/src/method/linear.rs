@@ -22,21 +22,21 @@ use std::sync::{Arc, OnceLock};
 
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::PixelShape;
+use shearq_quantities::linear::Symmetric;
 use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
 use shearq_submissions::{LinearMethod, PsfCut, ShearOrigin};
 
 use super::found::{Found, FoundObservables, NoiseMeans};
 use super::worker::{AdaptedSettings, CutEpoch, CutWorker, Images, image};
 use crate::error::MeasureError;
-use crate::measurement::{Descent, ResponseMatrix, Stop};
+use crate::measurement::{Descent, FLUX, QUANTITIES, ResponseMatrix, Stop};
 use crate::moments::{WeightedMoments, shear_origin};
 use crate::noise::StampNoise;
 use crate::psf::{
     ResidualProfiles, StarDenoiser, WIDTH_STEPS, gaussian_variance, noise_equivalent_area,
     width_factor, width_step,
 };
-use crate::random::hash;
-use crate::random::uniform;
+use crate::random::{hash, uniform};
 use crate::selection::ShearSettings;
 use crate::shape::{
     Ratio, Regularisation, RegularisationTerms, RoundMoments, SizeMoments, TypicalGalaxy,
@@ -552,28 +552,16 @@ impl PlanWorker {
         );
         let unit = f64::from(noise * noise) * plan.noise_moments_interval as f64;
         // The aperture corrects each factor of the flux.
-        let [unit, with_flux, with_fluxes] =
-            [0, 1, 2].map(|power| unit * plan.aperture.powi(power));
-        let means = |change: fn(NoiseChanges<f32>) -> f32| {
-            let of = |product| unit * f64::from(change(product));
-            let of_flux = |product| with_flux * f64::from(change(product));
-            let of_ratio =
-                |ratio: Ratio, product| unit * ratio.mean_second_derivative(change(product));
-            let [light1, light2] = products.e_light;
-            NoiseMeans {
-                e_e: products.e_e.map(of),
-                e_square: products.e_square.map(of),
-                e_flux: products.e_flux.map(of_flux),
-                square_square: of(products.square_square),
-                square_flux: of_flux(products.square_flux),
-                flux_flux: with_fluxes * f64::from(change(products.flux_flux)),
-                ring_e: products.ring_e.map(of),
-                ring_square: of(products.ring_square),
-                ring_flux: of_flux(products.ring_flux),
-                ring_ring: of(products.ring_ring),
-                e_curvature: [of_ratio(e1, light1), of_ratio(e2, light2)],
-                square_curvature: of_ratio(mean_square, products.square_zero),
-            }
+        let mut factors = [1.0; QUANTITIES];
+        factors[2 + FLUX] = plan.aperture;
+        let ratios = [e1, e2, mean_square];
+        let means = |change: fn(NoiseChanges<f32>) -> f32| NoiseMeans {
+            products: Symmetric::from_fn(|a, b| {
+                unit * (factors[a] * factors[b]) * f64::from(change(products.pairs[[a, b]]))
+            }),
+            curvature: std::array::from_fn(|k| {
+                unit * ratios[k].mean_second_derivative(change(products.with_divisors[k]))
+            }),
         };
         NoiseChanges {
             sheared: [

@@ -1,28 +1,19 @@
 //! Mean products of what noise does to two quantities of a galaxy.
 
+use shearq_quantities::linear::Symmetric;
+
+use crate::measurement::QUANTITIES;
 use crate::transform::Spectrum;
 
 use super::deconvolution::{Spectral, SpectralPsf, SpectralScratch};
 use super::noise::{NoiseChanges, sums_of_products, twice_scaled};
 
-/// Mean products of the changes with noise of σ = 1 of e₁, e₂, the size's T, the flux and the light of the ring, and those that
-/// their second derivatives consist of.
+/// Mean products of the changes with noise of σ = 1 of five quantities, and those that their second derivatives consist of.
 pub(crate) struct Products {
-    /// e₁ and e₁, e₁ and e₂, e₂ and e₂.
-    pub(crate) e_e: [NoiseChanges<f32>; 3],
-    pub(crate) e_square: [NoiseChanges<f32>; 2],
-    pub(crate) e_flux: [NoiseChanges<f32>; 2],
-    pub(crate) square_square: NoiseChanges<f32>,
-    pub(crate) square_flux: NoiseChanges<f32>,
-    pub(crate) flux_flux: NoiseChanges<f32>,
-    pub(crate) ring_e: [NoiseChanges<f32>; 2],
-    pub(crate) ring_square: NoiseChanges<f32>,
-    pub(crate) ring_flux: NoiseChanges<f32>,
-    pub(crate) ring_ring: NoiseChanges<f32>,
-    /// e₁′ · A₀ and e₂′ · A₀ of `RoundMoments`.
-    pub(crate) e_light: [NoiseChanges<f32>; 2],
-    /// T′ · P₀ of `SizeMoments`.
-    pub(crate) square_zero: NoiseChanges<f32>,
+    /// Of e₁, e₂, the flux, the size's T and the light of the ring, in this order.
+    pub(crate) pairs: Symmetric<QUANTITIES, NoiseChanges<f32>>,
+    /// e₁′ · A₀ and e₂′ · A₀ of `RoundMoments`, and T′ · P₀ of `SizeMoments`.
+    pub(crate) with_divisors: [NoiseChanges<f32>; 3],
 }
 
 impl Spectral {
@@ -53,19 +44,10 @@ impl Spectral {
         // The flux is the sum under the window.
         let (flux, ring) = (&self.window_spectrum, &self.ring_spectrum);
         let mean = |a: &Spectrum, b: &Spectrum| sums_of_products(a, b, &psf.powers);
+        let quantities = [e1, e2, flux, square, ring];
         Products {
-            e_e: [mean(e1, e1), mean(e1, e2), mean(e2, e2)],
-            e_square: [mean(e1, square), mean(e2, square)],
-            e_flux: [mean(e1, flux), mean(e2, flux)],
-            square_square: mean(square, square),
-            square_flux: mean(square, flux),
-            flux_flux: mean(flux, flux),
-            ring_e: [mean(e1, ring), mean(e2, ring)],
-            ring_square: mean(square, ring),
-            ring_flux: mean(flux, ring),
-            ring_ring: mean(ring, ring),
-            e_light: [mean(e1, light), mean(e2, light)],
-            square_zero: mean(square, zero),
+            pairs: Symmetric::from_fn(|a, b| mean(quantities[a], quantities[b])),
+            with_divisors: [mean(e1, light), mean(e2, light), mean(square, zero)],
         }
     }
 }

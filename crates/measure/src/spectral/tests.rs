@@ -638,8 +638,8 @@ fn products_of_noise_on_the_stamp(
         }
     }
     let mut largest = 0.0f64;
-    let [e11, _, e22] = found.e_e;
-    for (sums, found) in sums.into_iter().zip([e11, e22]) {
+    let own = [[0, 0], [1, 1]].map(|pair| found.pairs[pair]);
+    for (sums, found) in sums.into_iter().zip(own) {
         let [first, second] = found.sheared.map(f64::from);
         let plain = f64::from(found.plain);
         largest = largest.max(first.abs().max(second.abs()) / plain);
@@ -832,7 +832,7 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
         for_each_mode(&plan, &psf, &mut scratch, |change, flux, powers| {
             let of = |weights: &Vec<f32>| over_lags(&plan, weights, change);
             let [a, b, light, c, d] = weights.each_ref().map(of);
-            let quantities = [a, b, c, flux];
+            let quantities = [a, b, flux, c];
             let pairs = (0..4).flat_map(|k| quantities[k..].iter().map(move |q| quantities[k] * q));
             let products = pairs.chain([a * light, b * light, c * d]);
             let rows = expected.iter_mut().zip(&mut sizes).zip(products);
@@ -843,26 +843,12 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
                 }
             }
         });
-        let ([e11, e12, e22], [s1, s2], [f1, f2]) = (found.e_e, found.e_square, found.e_flux);
-        let (ss, sf, ff) = (found.square_square, found.square_flux, found.flux_flux);
-        let [light1, light2] = found.e_light;
-        let found = [
-            e11,
-            e12,
-            s1,
-            f1,
-            e22,
-            s2,
-            f2,
-            ss,
-            sf,
-            ff,
-            light1,
-            light2,
-            found.square_zero,
-        ];
-        for ((found, expected), size) in found.iter().zip(expected).zip(sizes) {
-            for (found, expected) in each(found).into_iter().zip(expected) {
+        let pairs = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
+        let found = pairs
+            .map(|pair| found.pairs[pair])
+            .chain(found.with_divisors);
+        for ((found, expected), size) in found.zip(expected).zip(sizes) {
+            for (found, expected) in each(&found).into_iter().zip(expected) {
                 // A thousand terms of both signs in single precision.
                 let difference = (f64::from(*found) - expected).abs();
                 assert!(difference < 1e-4 * size, "{found} {expected} {size}");
@@ -951,7 +937,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         });
         for kind in 0..4 {
             let of_kind = |product: NoiseChanges<f32>| *each(&product)[kind];
-            let products = [found.e_light[0], found.e_light[1], found.square_zero].map(of_kind);
+            let products = found.with_divisors.map(of_kind);
             let ratios = [e1, e2, mean_square].into_iter().zip(products);
             let found = ratios.map(|(ratio, product)| ratio.mean_second_derivative(product));
             for (k, found) in found.enumerate() {
