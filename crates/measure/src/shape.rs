@@ -393,24 +393,23 @@ impl SizeMoments {
     }
 }
 
-// Sums of products with each of the weights.
+// Sums of products with each of the weights, which are as many as the lags.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn sums<const N: usize>(lags: &[f32], weights: [&[f32]; N]) -> [f32; N] {
-    let whole = lags.len() - lags.len() % LANES;
-    let mut lanes = [[0.0f32; LANES]; N];
-    for at in (0..whole).step_by(LANES) {
-        let values = &lags[at..][..LANES];
-        for (lane, weights) in lanes.iter_mut().zip(weights) {
-            let weights = &weights[at..][..LANES];
+    let (lags, last_lags) = lags.as_chunks::<LANES>();
+    let mut sums = [0.0; N];
+    // One after the other: together they would not become vector instructions.
+    for (sum, weights) in sums.iter_mut().zip(weights) {
+        let (weights, last_weights) = weights.as_chunks::<LANES>();
+        let mut lanes = [0.0f32; LANES];
+        for (lags, weights) in lags.iter().zip(weights) {
             for l in 0..LANES {
-                lane[l] += values[l] * weights[l];
+                lanes[l] += lags[l] * weights[l];
             }
         }
-    }
-    let mut sums = lanes.map(|lane| lane.iter().sum::<f32>());
-    for k in whole..lags.len() {
-        for (sum, weights) in sums.iter_mut().zip(weights) {
-            *sum += lags[k] * weights[k];
+        *sum = lanes.iter().sum();
+        for (lag, weight) in last_lags.iter().zip(last_weights) {
+            *sum += lag * weight;
         }
     }
     sums

@@ -299,11 +299,14 @@ fn sum_of<P: Pixel, const SQUARES: bool>(pixels: ArrayView2<'_, P>) -> f64 {
     for row in pixels.into_outer_iter() {
         let row = contiguous(row);
         let (whole, rest) = row.as_chunks::<LANES>();
+        // A copy stays in registers, while the iterator below needs `sums` in memory.
+        let mut lanes = sums;
         for values in whole {
             for lane in 0..LANES {
-                sums[lane] += term(&values[lane]);
+                lanes[lane] += term(&values[lane]);
             }
         }
+        sums = lanes;
         for (sum, value) in sums.iter_mut().zip(rest) {
             *sum += term(value);
         }

@@ -122,9 +122,10 @@ pub(super) fn sums_of_products(
     let [mut first, mut second, mut turned, mut plain] = [[0.0f32; LANES]; 4];
     for at in (0..quarter).step_by(LANES) {
         let (a, b) = (four_lanes(a, at), four_lanes(b, at));
-        let [by_first, by_second] =
-            [&powers.sheared[0], &powers.sheared[1]].map(|p| parities(p, at));
-        let [by_turned, by_plain] = [&powers.turned, &powers.plain].map(|p| parities(p, at));
+        // A closure in `map` would be called for each, without vector instructions.
+        let [of_first, of_second] = &powers.sheared;
+        let (by_first, by_second) = (parities(of_first, at), parities(of_second, at));
+        let (by_turned, by_plain) = (parities(&powers.turned, at), parities(&powers.plain, at));
         for l in 0..LANES {
             let (even, odd) = (even_of_product(a, b, l), odd_of_product(a, b, l));
             first[l] += even * by_first.0[l] + odd * by_first.1[l];
