@@ -126,9 +126,13 @@ impl FileError {
     pub fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
         let found = names_of(found);
         let message = format!("there is no column `{wanted}`; columns found: {found}");
+        let number = wanted.parse::<f64>().ok();
+        let hint = number.map(|_| {
+            "leave it out: without columns, weights are 1 and no row has a flag".to_owned()
+        });
         FileError {
             no_column: true,
-            ..FileError::new(path, message)
+            ..FileError::new(path, message).hint_if(hint)
         }
     }
 

@@ -8,12 +8,16 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import h5py  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
-import yaml  # type: ignore[import-untyped, unused-ignore]
-from ceci import PipelineStage as PipelineStage  # type: ignore[import-untyped, unused-ignore]
-from ceci.config import StageParameter  # type: ignore[import-untyped, unused-ignore]
-from ceci.file_types import DataFile, FitsFile, HDFFile  # type: ignore[import-untyped, unused-ignore]
+
+try:
+    import h5py  # type: ignore[import-untyped, unused-ignore]
+    import yaml  # type: ignore[import-untyped, unused-ignore]
+    from ceci import PipelineStage as PipelineStage  # type: ignore[import-untyped, unused-ignore]
+    from ceci.config import StageParameter  # type: ignore[import-untyped, unused-ignore]
+    from ceci.file_types import DataFile, FitsFile, HDFFile  # type: ignore[import-untyped, unused-ignore]
+except ImportError as error:
+    raise ImportError(f"shearq.ceci: {error} (expected ceci and h5py). Try: pip install ceci h5py") from error
 
 from . import bias, measure
 
