@@ -17,6 +17,9 @@ use crate::pixels::{Pixel, contiguous};
 
 // One pixel off adds an ellipticity of about 0.01 for a PSF of 15 px. Chosen by hand.
 const MAX_CENTROID_OFFSET: f64 = 1.0;
+// Pixels over which the kernel of a shift ends. At ends that are abrupt, the rings of aliased light change m of odd stamps: ACS F606W at 0.05″
+// per px had +6, +13 (10⁻³) on 47 px and −3, +20 on 33 px. From 12 to 20 px, all sides of 33 to 65 px have −4, −3, as aliases on a centre must.
+const SHIFT_RADIUS_PX: f64 = 16.0;
 // Two vectors of AVX-512 in double precision, so that an addition does not wait for the one before.
 const LANES: usize = 16;
 
@@ -65,10 +68,10 @@ impl Star {
         brightest_pixel(stamp)?;
         let mut shifted = stamp.mapv(Into::<f64>::into);
         if along_y {
-            shifted = fourier_shift(rows, rows - 1, 0.5).dot(&shifted);
+            shifted = half_pixel_shift(rows).dot(&shifted);
         }
         if along_x {
-            shifted = shifted.dot(&fourier_shift(columns, columns - 1, 0.5).t());
+            shifted = shifted.dot(&half_pixel_shift(columns).t());
         }
         let found = cut_around_star(shifted.view(), cut)?;
         // Of the parity of the stamp, so that the star is in the middle of them.
@@ -281,6 +284,16 @@ pub(super) fn fourier_shift(from: usize, to: usize, first: f64) -> Array2<f64> {
     })
 }
 
+/// The matrix that interpolates samples halfway to the next ones: sin(πt)/(πt), which ends smoothly.
+fn half_pixel_shift(from: usize) -> Array2<f64> {
+    let radius = SHIFT_RADIUS_PX.min(0.5 * from as f64);
+    Array2::from_shape_fn((from - 1, from), |(row, column)| {
+        let t = row as f64 - column as f64 + 0.5;
+        let taper = (0.5 * PI * (t / radius).abs().min(1.0)).cos().powi(2);
+        taper * (PI * t).sin() / (PI * t)
+    })
+}
+
 fn sum<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
     sum_of::<P, false>(pixels)
 }
@@ -364,6 +377,15 @@ mod tests {
             assert!((found - expected).abs() < 1e-12, "{given}");
         }
         assert!(Star::cut(stamp.slice(s![..31, ..31]), sides).is_err());
+    }
+
+    #[test]
+    fn rings_of_a_shift_end_before_the_edge() {
+        let mut point = Array2::zeros((47, 47));
+        point[(23, 23)] = 1.0;
+        let shifted = cut(point.view(), limits(48, 32, true));
+        assert!(shifted[(22, 30)].abs() > 1e-3);
+        assert!(shifted[(22, 2)].abs() < 1e-12);
     }
 
     #[test]
