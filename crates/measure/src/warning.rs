@@ -134,7 +134,7 @@ pub enum Warning {
         used: bool,
     },
     /// The noise of the stamps disagrees with the one in the call.
-    #[error("the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears{}{}", significant(*given, 5), significant(*measured, 5), noise_advice(*given, *measured).0, tried(self.hint()))]
+    #[error("the given noise disagrees with the noise of the stamps (found {}, expected {}), which changes m by about {:+.3} at S/N 20, and by a quarter of it at S/N 40{}{}", significant(*given, 5), significant(*measured, 5), m_of_noise(given / measured), noise_advice(*given, *measured).0, tried(self.hint()))]
     GivenNoise { given: f64, measured: f64 },
     /// Noise is correlated, and the configuration treats it as white.
     #[error("the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0){}", correlation[0], correlation[1], tried(self.hint()))]
@@ -203,7 +203,7 @@ pub enum Warning {
         of: ExaminedPsfs,
     },
     /// The PSF image contains a background.
-    #[error("the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears{}", significant(100.0 * level, 3), 100.0 * share, tried(self.hint()))]
+    #[error("the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} %{}{}", significant(100.0 * level, 3), 100.0 * share, background_effect(*m), tried(self.hint()))]
     PsfBackground {
         /// Level in units of the peak.
         level: f64,
@@ -212,6 +212,8 @@ pub enum Warning {
         of: ExaminedPsfs,
     },
     /// Pixels of the PSF have another value than the pixels around them allow.
+        /// The change of m, infinite if no shapes remain; NaN where it is not known.
+        m: f64,
     #[error(
         "pixels of the PSF are not those of a star (found {}{of}; expected a smooth PSF). Dead pixels bias c by up to 0.01, dead rows m by 0.15, hot pixels m by 0.02, cores cut at 0.9 of the peak m by 0.02, at 0.7 by 0.08{}",
         match (*dead, *hot) {
@@ -667,7 +669,10 @@ fn noise_advice(given: f64, measured: f64) -> (&'static str, &'static str) {
             "take the square root",
         )
     } else {
-        ("", "leave out the noise, so that it is measured")
+        (
+            "",
+            "without `noise` (Python), --variance or --weight-map (gather), so that the noise is measured",
+        )
     }
 }
 
@@ -690,6 +695,23 @@ fn six_digits(scale: f64) -> f64 {
         return scale;
     }
     let unit = 10f64.powf(5.0 - scale.log10().floor());
+/// What a background of the PSF does to m.
+fn background_effect(m: f64) -> String {
+    if m.is_nan() {
+        " and biases shears".to_owned()
+    } else if m.is_infinite() {
+        ", and leaves galaxies no width after deconvolution".to_owned()
+    } else {
+        format!(" and m by about {m:+.3}, to a factor of 2 for galaxies as wide as the PSF")
+    }
+}
+
+/// m at S/N 20 if the given noise is `ratio` times the true one.
+fn m_of_noise(ratio: f64) -> f64 {
+    let excess = ratio * ratio - 1.0;
+    -M_BY_GIVEN_VARIANCE * excess / (1.0 + M_BY_GIVEN_VARIANCE * excess)
+}
+
     (scale * unit).round() / unit
 }
 
@@ -703,5 +725,61 @@ fn advice(flag: Flag) -> &'static str {
         Flag::NoScale => "check that the stamps are not blank and that the noise is known",
         Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",
         Flag::NoShear => "check that there is a galaxy on the stamps",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    #[test]
+    fn faint_galaxies_are_told_from_stamps_without_any() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut found = |mean: f64, empty: usize| {
+            let mut draw = |k: usize| -> f64 {
+                let noise: f64 = StandardNormal.sample(&mut rng);
+                noise + if k < empty { 0.0 } else { mean }
+            };
+            let snr: Vec<f64> = (0..1000).map(&mut draw).collect();
+            negative_by_more_than_chance(&snr).is_some()
+        };
+        // The column `snr` is 0.74 of the S/N: 3, 5 and 20.
+        assert!(!found(2.2, 0) && !found(3.7, 0) && !found(15.0, 0));
+        assert!(found(3.7, 100) && found(15.0, 20) && found(15.0, 300) && found(2.2, 500));
+    }
+
+    #[test]
+    fn tails_of_noise_are_no_defects() {
+        let counts = |dark, bright| DefectCounts {
+            dark,
+            bright,
+            ..DefectCounts::default()
+        };
+        assert!(are_tails(counts(154, 47), 178));
+        // Cosmic rays, areas of fill values, and bad columns.
+        assert!(!are_tails(counts(3, 47), 50));
+        assert!(!are_tails(counts(500, 0), 10));
+        let lines = DefectCounts {
+            lines: 48,
+            ..counts(1, 0)
+        };
+        assert!(!are_tails(lines, 48));
+    }
+
+    #[test]
+    fn a_wrong_noise_level_states_its_m() {
+        for (ratio, m) in [
+            (1.05, -0.008),
+            (1.5, -0.088),
+            (2.0, -0.19),
+            (0.8, 0.028),
+            (0.5, 0.058),
+        ] {
+            assert!((m_of_noise(ratio) / m - 1.0).abs() < 0.1, "{ratio}");
+        }
     }
 }

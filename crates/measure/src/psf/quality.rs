@@ -28,6 +28,18 @@ const RING_FALL: f64 = 3.0;
 const SIGNIFICANCE: f64 = 5.0;
 // Light of a background, in units of the star's. Above it |m| may exceed 2·10⁻³. Chosen by hand.
 const MAX_BACKGROUND: f64 = 0.1;
+// Pixels a side in which the light of a background changes m: those of a PSF that 48/linear/star uses.
+const BACKGROUND_SIDE: usize = 48;
+// PSFs of fewer pixels have m of either sign, +0.005 to +0.4. 32 px: the simulations below.
+const MIN_BACKGROUND_SIDE: usize = 44;
+// m over the square of the background's light on these pixels in units of the star's. Galaxies of half-light radii 2.2 to 4 px (1.8 to 3.5 px
+// for the FWHM of 2.4 px) at S/N 20: −0.003, −0.041, −0.20 for 0.3, 1 and 2 % of the peak of a Moffat PSF of FWHM 3.4 px (shares 0.33, 1.1,
+// 2.2), −0.005 and −0.11 for 0.3 and 1 % at 2.4 px (0.58, 1.9); the same at S/N 60. Half-light radii of 4 to 6 px: +0.009, −0.018, −0.23.
+const M_PER_SQUARED_BACKGROUND: f64 = -0.033;
+// Further light changes m no more. The same simulations: −0.71 for 5 % (share 5.6), −0.78 for 2 % at 2.4 px (3.9).
+const LEAST_M_OF_BACKGROUND: f64 = -0.8;
+// Share of a negative background from which the deconvolved light has no width. The same simulations: −0.003 for −0.17, and no shapes for −0.29.
+const DARK_BACKGROUND: f64 = -0.2;
 // In units of the peak: stamps without a star have any level.
 const MAX_STATED_LEVEL: f64 = 100.0;
 // Light of a gradient that is extrapolated from the brighter edge, in units of the star's. Chosen by hand.
@@ -108,6 +120,8 @@ pub(crate) struct PsfQuality {
     /// Background: level in units of the peak, light in units of the star's.
     level: f64,
     background: f64,
+    /// The change of m by the background, infinite if no shapes remain; NaN where it is not known.
+    background_m: f64,
     /// Gradient of the background: change per pixel in units of the peak, light in units of the star's.
     slope: [f64; 2],
     gradient: f64,
@@ -192,6 +206,7 @@ impl PsfQuality {
             0.0
         };
         let pixels = (n * n) as f64;
+        let used = n.min(BACKGROUND_SIDE).pow(2) as f64;
         let star = (1.0 - level * pixels).max(f64::MIN_POSITIVE);
         let [left, right, bottom, top] = edges.map(|edge| edge.mean());
         let across = (n - BORDER) as f64;
@@ -235,6 +250,10 @@ impl PsfQuality {
             snr: (power - count * noise * noise).max(0.0).sqrt() / noise,
             level: (level / peak).clamp(-MAX_STATED_LEVEL, MAX_STATED_LEVEL),
             background: level * pixels / star,
+            background_m: match n {
+                MIN_BACKGROUND_SIDE.. => m_of_background(level * used / star),
+                _ => f64::NAN,
+            },
             slope: slope.map(|slope| slope / peak),
             gradient: steep * 0.5 * n as f64 * pixels / star,
             power: moduli[1],
@@ -244,6 +263,14 @@ impl PsfQuality {
             moved,
             offset,
         })
+    }
+}
+
+// The change of m by a background with this light, in units of the star's.
+fn m_of_background(share: f64) -> f64 {
+    match share < DARK_BACKGROUND {
+        true => f64::INFINITY,
+        false => (M_PER_SQUARED_BACKGROUND * share * share).max(LEAST_M_OF_BACKGROUND),
     }
 }
 
@@ -428,6 +455,7 @@ pub(crate) fn psf_warnings(
         found.push(Warning::PsfBackground {
             level: psfs.median(|psf| psf.level),
             share: psfs.median(|psf| psf.background),
+            m: psfs.median(|psf| psf.background_m),
             of: psfs.of,
         });
     }
@@ -603,6 +631,27 @@ mod tests {
         for (profile, fwhm) in [(MOFFAT, 0.3), (MOFFAT, 1.0), (PsfProfile::Kolmogorov, 1.0)] {
             assert_eq!(kinds(&sheared(profile, fwhm, 48)), ["psf-narrow"], "{fwhm}");
         }
+    }
+
+    #[test]
+    fn a_background_of_a_psf_states_its_m() {
+        let m = |side: usize, share: f64| {
+            let psf = sheared(MOFFAT, 3.4, side);
+            let psf = &psf + share * psf.iter().copied().fold(0.0, f64::max);
+            let found = PsfQuality::from_psf((&psf / psf.sum()).view(), None);
+            found.unwrap().background_m
+        };
+        // Measured ones, to a factor of 1.4.
+        for (share, expected) in [(0.003, -0.003), (0.01, -0.041), (0.02, -0.2), (0.05, -0.71)] {
+            for side in [48, 64] {
+                assert!(
+                    (m(side, share) / expected).ln().abs() < 0.34,
+                    "{side} {share}"
+                );
+            }
+        }
+        assert_eq!(m(48, -0.003), f64::INFINITY);
+        assert!(m(32, 0.01).is_nan());
     }
 
     #[test]
