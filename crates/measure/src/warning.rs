@@ -80,9 +80,8 @@ pub enum Warning {
     },
     /// Rows or columns of the image have levels of their own.
     #[error(
-        "the noise is banded (found {} with levels that differ by {scatter:.2} of the noise; expected one level), which changes c1 by about {:+.4} at S/N 20, and by a quarter of it at S/N 40{}",
+        "the noise is banded (found {} with levels that differ by {scatter:.2} of the noise; expected one level), which changes c1 by about {c1:+.4} and m by about {m:+.4} at S/N 20, and by a quarter of it at S/N 40{}",
         if *rows { "rows" } else { "columns" },
-        if *rows { C1_BY_BANDING } else { -C1_BY_BANDING } * scatter * scatter,
         tried(self.hint())
     )]
     Banding {
@@ -91,6 +90,9 @@ pub enum Warning {
         /// Root mean square of the levels in units of the noise.
         scatter: f64,
     },
+        /// The changes of m and c1 at S/N 20.
+        m: f64,
+        c1: f64,
     /// The stamps have skies of several levels.
     #[error("the sky differs between stamps (found levels with a scatter of {scatter:.2} of the noise; expected one level){}", tried(self.hint()))]
     SkyLevels {
@@ -376,9 +378,15 @@ pub enum Warning {
     Flagged { flag: Flag, count: usize, of: usize },
 }
 
-// Change of c1 at S/N 20 by rows with independent levels, in units of their squared scatter over the noise. 12 realizations with 1024 galaxies
-// each: +0.00095 ± 0.0001 for 0.1, +0.0042 ± 0.0003 for 0.2; columns −0.0055 ± 0.0003 for 0.2.
-const C1_BY_BANDING: f64 = 0.11;
+// m at S/N 20 by the relative excess v of the given variance, as −v/(1/this + v). 800 galaxies: −0.008, −0.033, −0.088 and −0.19 for a given σ
+// that is 1.05, 1.2, 1.5 and 2 times the true one, +0.007, +0.028 and +0.058 for 0.95, 0.8 and 0.5; a quarter of it at S/N 40.
+const M_BY_GIVEN_VARIANCE: f64 = 0.077;
+// m times the S/N and the noise of a pixel in electrons: docs/survey.md, S/N 30 over 100 and 10 electrons of sky, +0.004 and +0.013.
+const M_BY_POISSON_NOISE: f64 = 1.2;
+// Least m that is stated: what Euclid requires.
+const MIN_POISSON_M: f64 = 0.002;
+// The column `snr` in units of the S/N: docs/limitations.md.
+const SNR_COLUMN: f64 = 0.74;
 // Share of negative fluxes of galaxies at S/N 5, whose column `snr` is 3.7 in the mean.
 const NEGATIVE_AT_SNR_5: f64 = 1e-4;
 // Standard deviations of a number beyond chance. Chosen by hand.

@@ -330,7 +330,7 @@ fn examined(change: impl Fn(f64, &mut StampStatistics)) -> Examination {
                 saddle: 0.0,
                 noise: [1.0; 2],
                 pairs: [0.0, 0.0, 100.0],
-                bands: [0.0; 2],
+                bands: [[0.0; 3]; 2],
                 place: [0.0; 2],
                 flux: 1000.0,
                 peak: 20.0,
@@ -398,12 +398,13 @@ fn warnings_about_stamps_begin_at_their_limits() {
     });
     for of in [[1.0, 0.3], [0.3, 1.0]] {
         begins_at(0.004, "banding", |square| {
-            examined(|_, stamp| stamp.bands = of.map(|share| share * square)).warnings()
+            examined(|_, stamp| stamp.bands = of.map(|share| [share * square, 0.0, 0.0])).warnings()
         });
     }
     // The other direction.
     begins_at(1.0 / 0.33, "banding", |ratio| {
-        examined(|_, stamp| stamp.bands = [0.01, 0.01 / ratio]).warnings()
+        examined(|_, stamp| stamp.bands = [0.01, 0.01 / ratio].map(|all| [all, 0.0, 0.0]))
+            .warnings()
     });
     // Half of the correlation.
     begins_at(0.5, "sky-levels", |share| {
@@ -616,6 +617,13 @@ fn bands_and_skies_of_stamps_are_named() {
         one(
             kinds(&|_, [.., sky]| scatter * sky[0]),
             "noise.sky = \"stamp\"",
+    // Levels of odd and even columns have the other sign of c1, and an m; those of rows the opposite c1.
+    let alternate = |at: usize| if at.is_multiple_of(2) { 0.2 } else { -0.2 };
+    one(kinds(&|[.., x], _| alternate(x)), "c1 by about +0.003");
+    one(kinds(&|[.., x], _| alternate(x)), "m by about -0.003");
+    one(kinds(&|[_, y, _], _| alternate(y)), "c1 by about -0.003");
+    let two_and_two = |at: usize| if at % 4 < 2 { 0.2 } else { -0.2 };
+    one(kinds(&|[.., x], _| two_and_two(x)), "m by about -0.01");
         );
     }
     // Straight gradients along one axis are no bands.
