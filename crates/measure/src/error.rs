@@ -45,7 +45,7 @@ pub enum MeasureError {
     #[error("there is no memory for {0} galaxies")]
     Memory(usize),
     /// No light to normalise a PSF by.
-    #[error("the pixels of the PSF stamp sum to {0}; expected a positive sum")]
+    #[error("the pixels of the PSF stamp sum to {sum}; expected a positive sum{}", tried(self.hint()), sum = .0)]
     DarkPsf(f64),
     /// A star so near an edge of its stamp that it cannot be cut around itself.
     #[error("the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star{}", tried(self.hint()))]
@@ -124,12 +124,16 @@ impl EpochError {
     }
 }
 
+/// What to try with a PSF of a negative sum.
+pub const INVERTED_PSF: &str = "the PSF times -1 if its star is darker than its surroundings, or without its negative background";
+
 impl MeasureError {
     hints! {
         Self::Epochs(error) => return error.hint(),
         Self::Data(warning) => return warning.hint(),
         Self::NoBorders { .. } => "stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels (cut off, or left out by a settings file with a smaller stamp.size); for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
         Self::OffCentre { .. } => "a larger PSF stamp, or one that is centred on the star to within 1 px",
+        Self::DarkPsf(sum) if *sum < 0.0 => INVERTED_PSF,
         Self::NoStamps => "shearq detect",
         Self::ShearedPixels { most, .. } if *most < 0.1 => "a linear configuration, such as 48/linear/star",
         Self::ShearedPixels { .. } => "resampled images",

@@ -72,7 +72,7 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
-pub use error::{EpochError, MeasureError};
+pub use error::{EpochError, INVERTED_PSF, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
     Coupling, DefectCounts, Descent, Flag, Flags, Measurement, Observables, PsfShape,

@@ -8,7 +8,8 @@ use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_files::{FileError, atomic};
 use shearq_measure::{
-    EXAMINED_PSFS, Examination, ExaminedPsfs, Oversampling, Psfs, Star, Truncation, Warning,
+    EXAMINED_PSFS, Examination, ExaminedPsfs, INVERTED_PSF, Oversampling, Psfs, Star, Truncation,
+    Warning,
 };
 use shearq_quantities::linear::Matrix2;
 use shearq_submissions::PsfCut;
@@ -126,7 +127,9 @@ pub(super) fn gather_psfs(
         if count == 1 && writer.dark > 0 {
             let missing = pixels.iter().filter(|value| !value.is_finite()).count();
             return Err(match missing {
-                0 => origin.fault(&format!("the pixels of the PSF add up to {light}; expected a positive sum")),
+                0 => origin
+                    .fault(&format!("the pixels of the PSF add up to {light}; expected a positive sum"))
+                    .hint_if((light < 0.0).then(|| INVERTED_PSF.to_owned())),
                 _ => origin
                     .fault(&format!(
                         "{missing} of {} pixels of the PSF are missing (NaN or infinite; expected none)",
