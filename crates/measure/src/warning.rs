@@ -10,7 +10,7 @@ use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
-use crate::measurement::{DefectCounts, Flag, Measurement};
+use crate::measurement::{DefectCounts, Flag, Measurement, Observables};
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
@@ -89,10 +89,10 @@ pub enum Warning {
         rows: bool,
         /// Root mean square of the levels in units of the noise.
         scatter: f64,
-    },
         /// The changes of m and c1 at S/N 20.
         m: f64,
         c1: f64,
+    },
     /// The stamps have skies of several levels.
     #[error("the sky differs between stamps (found levels with a scatter of {scatter:.2} of the noise; expected one level){}", tried(self.hint()))]
     SkyLevels {
@@ -211,11 +211,11 @@ pub enum Warning {
         level: f64,
         /// Its light in units of the star's.
         share: f64,
+        /// The change of m, infinite if no shapes remain; NaN where it is not known.
+        m: f64,
         of: ExaminedPsfs,
     },
     /// Pixels of the PSF have another value than the pixels around them allow.
-        /// The change of m, infinite if no shapes remain; NaN where it is not known.
-        m: f64,
     #[error(
         "pixels of the PSF are not those of a star (found {}{of}; expected a smooth PSF). Dead pixels bias c by up to 0.01, dead rows m by 0.15, hot pixels m by 0.02, cores cut at 0.9 of the peak m by 0.02, at 0.7 by 0.08{}",
         match (*dead, *hot) {
@@ -381,14 +381,13 @@ pub enum Warning {
 // m at S/N 20 by the relative excess v of the given variance, as −v/(1/this + v). 800 galaxies: −0.008, −0.033, −0.088 and −0.19 for a given σ
 // that is 1.05, 1.2, 1.5 and 2 times the true one, +0.007, +0.028 and +0.058 for 0.95, 0.8 and 0.5; a quarter of it at S/N 40.
 const M_BY_GIVEN_VARIANCE: f64 = 0.077;
-// m times the S/N and the noise of a pixel in electrons: docs/survey.md, S/N 30 over 100 and 10 electrons of sky, +0.004 and +0.013.
-const M_BY_POISSON_NOISE: f64 = 1.2;
-// Least m that is stated: what Euclid requires.
-const MIN_POISSON_M: f64 = 0.002;
-// The column `snr` in units of the S/N: docs/limitations.md.
-const SNR_COLUMN: f64 = 0.74;
 // Share of negative fluxes of galaxies at S/N 5, whose column `snr` is 3.7 in the mean.
 const NEGATIVE_AT_SNR_5: f64 = 1e-4;
+// Share of negative fluxes that no galaxies of S/N 2 or more have: their mean column `snr` is 1.5. More are stamps without a galaxy.
+const MAX_NEGATIVE_OF_FAINT: f64 = 0.1;
+// Pixels without light per stamp that has any, up to which darker ones than bright ones are tails of the noise: Student's t of 5 degrees of
+// freedom has 1.1 (0.77 of them dark), with m as without tails. Dead pixels and fill values come in areas, and cosmic rays are bright.
+const MAX_TAIL_PIXELS: f64 = 1.5;
 // Standard deviations of a number beyond chance. Chosen by hand.
 const MIN_EXCESS: f64 = 5.0;
 // Relative difference of a noise level from a power of another one that is taken for it. Chosen by hand.
@@ -507,18 +506,14 @@ impl Warning {
         flags.chain(Warning::of_idle(galaxies))
     }
 
-    /// A warning if more galaxies have a negative flux than those of S/N 5 by chance. They keep their rows: a flag that depends on the
-    /// flux selects by shear, and half of the stamps without a galaxy have a positive one.
+    /// A warning if many galaxies have a negative flux. They keep their rows: a flag that depends on the flux selects by shear, and half
+    /// of the stamps without a galaxy have a positive one.
     fn of_empty(galaxies: &[Measurement]) -> Option<Warning> {
-        let (mut count, mut of) = (0, 0);
         let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
-        for observables in good.filter_map(|galaxy| galaxy.observables.as_ref()) {
-            count += usize::from(observables.flux < 0.0);
-            of += 1;
-        }
-        let chance = NEGATIVE_AT_SNR_5 * of as f64;
-        let is_chance = count as f64 <= 1.0 + chance + MIN_EXCESS * chance.sqrt();
-        (!is_chance && 2 * count <= of).then_some(Warning::Empty { count, of })
+        let observables = good.filter_map(|galaxy| galaxy.observables.as_ref());
+        let snr: Vec<f64> = observables.map(Observables::snr).collect();
+        let (count, of) = (negative_by_more_than_chance(&snr)?, snr.len());
+        (2 * count <= of).then_some(Warning::Empty { count, of })
     }
 
     fn of_defects(galaxies: &[Measurement]) -> Option<Warning> {
@@ -529,7 +524,7 @@ impl Warning {
             stamps += 1;
             flagged += usize::from(!galaxy.flags.is_empty());
         }
-        (stamps > 0).then_some(Warning::Defects {
+        (stamps > 0 && (flagged > 0 || !are_tails(counts, stamps))).then_some(Warning::Defects {
             counts,
             stamps,
             flagged,
@@ -658,6 +653,23 @@ fn gradient(slope: [f64; 2], error: f64, noise: f64, subtracted: bool) -> String
     )
 }
 
+/// What a background of the PSF does to m.
+fn background_effect(m: f64) -> String {
+    if m.is_nan() {
+        " and biases shears".to_owned()
+    } else if m.is_infinite() {
+        ", and leaves galaxies no width after deconvolution".to_owned()
+    } else {
+        format!(" and m by about {m:+.3}, to a factor of 2 for galaxies as wide as the PSF")
+    }
+}
+
+/// m at S/N 20 if the given noise is `ratio` times the true one.
+fn m_of_noise(ratio: f64) -> f64 {
+    let excess = ratio * ratio - 1.0;
+    -M_BY_GIVEN_VARIANCE * excess / (1.0 + M_BY_GIVEN_VARIANCE * excess)
+}
+
 /// What may be wrong with a given noise level, and what to try: a map of standard deviations, or of squared variances, in place of
 /// variances.
 fn noise_advice(given: f64, measured: f64) -> (&'static str, &'static str) {
@@ -684,6 +696,33 @@ fn noise_advice(given: f64, measured: f64) -> (&'static str, &'static str) {
     }
 }
 
+/// The number of galaxies with a negative S/N, if it exceeds that of galaxies of S/N 5, or of the fainter ones that the positive numbers
+/// show.
+fn negative_by_more_than_chance(snr: &[f64]) -> Option<usize> {
+    let of = snr.len() as f64;
+    let count = snr.iter().filter(|snr| **snr < 0.0).count();
+    let mut positive: Vec<f64> = snr.iter().copied().filter(|snr| *snr > 0.0).collect();
+    let rank = positive.len() / 4;
+    let faint = match positive.is_empty() {
+        true => f64::INFINITY,
+        false => *positive.select_nth_unstable_by(rank, f64::total_cmp).1,
+    };
+    // Above the share of negative numbers of variance 1 about this mean.
+    let of_faint = match count as f64 > MAX_NEGATIVE_OF_FAINT * of {
+        true => 0.0,
+        false => 0.5 * (-0.5 * faint * faint).exp(),
+    };
+    let chance = NEGATIVE_AT_SNR_5.max(of_faint) * of;
+    (count as f64 > 1.0 + chance + MIN_EXCESS * chance.sqrt()).then_some(count)
+}
+
+/// Whether pixels that were removed on these stamps are the tails of their noise.
+fn are_tails(counts: DefectCounts, stamps: usize) -> bool {
+    let DefectCounts { dark, bright, .. } = counts;
+    let few = f64::from(counts.total()) <= MAX_TAIL_PIXELS * stamps as f64;
+    few && dark >= bright && dark + bright == counts.total()
+}
+
 /// A number with `digits` significant digits, in whatever unit pixels have.
 fn significant(value: f64, digits: i32) -> String {
     if value == 0.0 {
@@ -703,23 +742,6 @@ fn six_digits(scale: f64) -> f64 {
         return scale;
     }
     let unit = 10f64.powf(5.0 - scale.log10().floor());
-/// What a background of the PSF does to m.
-fn background_effect(m: f64) -> String {
-    if m.is_nan() {
-        " and biases shears".to_owned()
-    } else if m.is_infinite() {
-        ", and leaves galaxies no width after deconvolution".to_owned()
-    } else {
-        format!(" and m by about {m:+.3}, to a factor of 2 for galaxies as wide as the PSF")
-    }
-}
-
-/// m at S/N 20 if the given noise is `ratio` times the true one.
-fn m_of_noise(ratio: f64) -> f64 {
-    let excess = ratio * ratio - 1.0;
-    -M_BY_GIVEN_VARIANCE * excess / (1.0 + M_BY_GIVEN_VARIANCE * excess)
-}
-
     (scale * unit).round() / unit
 }
 
