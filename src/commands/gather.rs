@@ -57,7 +57,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
-    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV, SIN, STG). Catalogues have its identifiers and positions.
+    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV, SIN, STG, CAR). Catalogues have its identifiers and positions.
     /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file. One table for all exposures, or one for each.
     /// With --stamps, a row per stamp in their order: its columns id, x, y, ra and dec are copied as they are.
     #[arg(long, value_name = "FILE", num_args = 1..)]

@@ -15,6 +15,8 @@ use self::map::{Map, Projection, regular_inverse};
 // Keys of the matrix from pixels to the sky.
 const CD_KEYS: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
 // Least relative difference of scales that is reported: it changes m by about as much.
+/// Projections that are read, in the words of messages.
+pub(crate) const READ_PROJECTIONS: &str = "TAN, TAN-SIP, TPV, SIN, STG, CAR or a linear one";
 const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
 // Relative difference of the pixels of stamps from those at the reference point, by a distortion, above which stamps without places
 // are refused: it adds as much to c. Chosen by hand: a tenth of what surveys require.
@@ -39,7 +41,7 @@ impl Wcs {
         let map = self.map.as_ref()?;
         Some(match map.projection {
             Projection::Plane => map.matrix,
-            Projection::Zenithal { .. } => {
+            Projection::Sky { .. } => {
                 let plain = Map {
                     sip: None,
                     ..map.clone()
@@ -75,7 +77,7 @@ impl Wcs {
 
     pub(crate) fn has_sky(&self) -> bool {
         let projection = self.map.as_ref().map(|map| &map.projection);
-        matches!(projection, Some(Projection::Zenithal { .. }))
+        matches!(projection, Some(Projection::Sky { .. }))
     }
 
     /// Right ascension and declination of a pixel in degrees.
@@ -95,7 +97,7 @@ impl Wcs {
 
     /// What is wrong with a header that states a WCS but gives no places on the sky; `None` for a usable WCS, and without one.
     pub(crate) fn fault(&self) -> Option<String> {
-        let expected = "expected TAN, TAN-SIP, TPV, SIN, STG or a linear one";
+        let expected = format!("expected {READ_PROJECTIONS}");
         match (&self.damage, &self.unread) {
             (Some(damage), _) => Some(damage.clone()),
             (None, Some(kind)) => Some(format!("the projection {kind} is not read ({expected})")),
@@ -255,7 +257,7 @@ mod tests {
                 checked += 1;
             }
         }
-        assert_eq!(checked, 124);
+        assert_eq!(checked, 133);
         let wcs = sky([-1.0, 0.0, 0.0, 1.0]);
         assert_eq!(wcs.pixel([180.0, 0.0]), None);
     }

@@ -19,7 +19,7 @@ use super::mosaic::{Origins, StampWriter};
 use super::positions::{Positions, Table, pixels_of_rows, rows_of_stamps};
 use super::request::{Gathering, Square, Stamps};
 use crate::stamp_table::{self, Head};
-use crate::wcs::{Wcs, aligned};
+use crate::wcs::{READ_PROJECTIONS, Wcs, aligned};
 
 // Most stamps of one image: one per galaxy of the largest grid.
 const MAX_STAMPS: usize = MAX_ROWS;
@@ -118,8 +118,7 @@ impl Plan {
             if let Some(error) = self.stack.wcs.fault() {
                 return Err(fault(&error).hint(PIXEL_AXES));
             }
-            let expected =
-                "and the header has no WCS (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one)";
+            let expected = format!("and the header has no WCS (expected {READ_PROJECTIONS})");
             return match (frame, gathering.frame) {
                 (Some(Frame::Sky), Some(_)) => Err(fault(&format!("--frame is sky, {expected}"))),
                 (Some(Frame::Sky), None) => Err(fault(&format!(
@@ -131,18 +130,18 @@ impl Plan {
                 _ => Ok(None),
             };
         };
+        if let Some(kind) = self.stack.wcs.unread() {
+            let message = format!(
+                "the WCS is {kind} (expected {READ_PROJECTIONS}), so that the pixels on the sky are not known"
+            );
+            return Err(fault(&message).hint(PIXEL_AXES));
+        }
+        for (row, jacobian) in all.iter().enumerate() {
         // Pixels that are already along the sky need no Jacobians, which take time in each measurement.
         let plain = all.iter().all(aligned);
         if plain && frame.is_none() {
             return Ok(None);
         }
-        if let Some(kind) = self.stack.wcs.unread() {
-            let message = format!(
-                "the WCS is {kind} (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one), so that the pixels on the sky are not known"
-            );
-            return Err(fault(&message).hint(PIXEL_AXES));
-        }
-        for (row, jacobian) in all.iter().enumerate() {
             if let Err(error) = Jacobian::new(*jacobian) {
                 let row = row + 1;
                 let message = format!("the WCS has no inverse at stamp {row}: {error}");

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use shearq_files::names_of;
 use shearq_quantities::linear::{Matrix2, determinant};
 
-use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection, Zenithal};
+use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection, SkyProjection};
 
 // Keys with the pixel scale in arcseconds: of surveys, of GalSim and of STPSF.
 const PIXEL_SCALE_KEYS: [&str; 3] = ["PIXSCALE", "GS_SCALE", "PIXELSCL"];
@@ -307,14 +307,20 @@ impl Wcs {
             ));
         }
         let origin = ["CRPIX1", "CRPIX2"].map(|key| keys.number(key).unwrap_or(0.0));
-        let zenithal = match projections[0] {
+        let centre = [0, 1].map(|i| {
+            let value = keys.number(["CRVAL1", "CRVAL2"][i]).unwrap_or(0.0);
+            value * units[i] / 3600.0
+        });
+        let (ra, dec) = (centre[longitude], centre[1 - longitude]);
+        let kind_of_sky = match projections[0] {
             _ if !equatorial => None,
-            "TAN" | "TPV" => Some(Zenithal::Gnomonic),
-            "STG" => Some(Zenithal::Stereographic),
-            "SIN" => Some(Zenithal::Orthographic),
+            "TAN" | "TPV" => Some(SkyProjection::Gnomonic),
+            "STG" => Some(SkyProjection::Stereographic),
+            "SIN" => Some(SkyProjection::Orthographic),
+            "CAR" if is_upright(keys, dec) => Some(SkyProjection::PlateCarree),
             _ => None,
         };
-        let Some(zenithal) = zenithal else {
+        let Some(kind_of_sky) = kind_of_sky else {
             let west = |row: [f64; 2]| row.map(|value| -value);
             let matrix = match (plane, latitude_first) {
                 (true, _) => [first, second],
@@ -348,23 +354,25 @@ impl Wcs {
             };
         };
         let degrees = |row: [f64; 2]| row.map(|value| value / 3600.0);
-        let centre = [0, 1].map(|i| {
-            let value = keys.number(["CRVAL1", "CRVAL2"][i]).unwrap_or(0.0);
-            value * units[i] / 3600.0
-        });
-        let (ra, dec) = (centre[longitude], centre[1 - longitude]);
         let distortion = match Distortion::of(keys, &kinds, longitude) {
             Ok(distortion) => distortion,
             Err(damage) => return only_scale(None).damaged(damage),
         };
         // The default of LONPOLE for zenithal projections; PVi_3 of the axis of longitudes replaces the key (Calabretta & Greisen
         // 2002).
-        let default = if dec >= 90.0 { 0.0 } else { 180.0 };
+        let default = match kind_of_sky {
+            SkyProjection::PlateCarree => 180.0,
+            _ if dec >= 90.0 => 0.0,
+            _ => 180.0,
+        };
         let by_pv = match distortion.tpv {
             None => keys.number(&format!("PV{}_3", longitude + 1)),
             Some(_) => None,
         };
-        let lonpole = by_pv.or_else(|| keys.number("LONPOLE"));
+        let lonpole = match kind_of_sky {
+            SkyProjection::PlateCarree => None,
+            _ => by_pv.or_else(|| keys.number("LONPOLE")),
+        };
         let Distortion {
             sip,
             tpv,
@@ -380,8 +388,8 @@ impl Wcs {
                     true => [degrees(second), degrees(first)],
                     false => [degrees(first), degrees(second)],
                 },
-                projection: Projection::Zenithal {
-                    kind: zenithal,
+                projection: Projection::Sky {
+                    kind: kind_of_sky,
                     ra,
                     dec,
                     lonpole: lonpole.unwrap_or(default).to_radians(),
@@ -460,6 +468,21 @@ fn scaled(keys: &Keys, latitude: usize) -> Option<(Matrix2, bool)> {
 
 struct Distortion {
     sip: Option<[Polynomial; 2]>,
+/// Whether north is up at the reference point of CAR, as it is by default: native longitudes of the pole other than 0 for northern
+/// points and 180° for southern ones have no solution, or turn the sphere (Calabretta & Greisen 2002, eq. 8 to 10).
+fn is_upright(keys: &Keys, dec: f64) -> bool {
+    let of = |key: &str, default: f64| keys.number(key).unwrap_or(default);
+    let up = match of("LONPOLE", if dec >= 0.0 { 0.0 } else { 180.0 }) {
+        0.0 => dec >= 0.0,
+        180.0 => dec <= 0.0,
+        _ => false,
+    };
+    let moved = [
+        "PV1_1", "PV1_2", "PV1_3", "PV1_4", "PV2_1", "PV2_2", "PV2_3", "PV2_4",
+    ];
+    up && of("LATPOLE", 90.0) >= 0.0 && !moved.iter().any(|key| keys.has(key))
+}
+
     tpv: Option<[Polynomial; 2]>,
     doubts: Vec<String>,
 }

@@ -1,4 +1,4 @@
-//! From pixels to the sky: distortions, zenithal projections, and their derivatives.
+//! From pixels to the sky: distortions, projections, and their derivatives.
 
 use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
 
@@ -53,9 +53,9 @@ impl Polynomial {
 pub(super) enum Projection {
     // Arcseconds; of simulations and of projections that are not read.
     Plane,
-    /// A zenithal one about a point, with the distortion of TPV or without.
-    Zenithal {
-        kind: Zenithal,
+    /// One about a point, with the distortion of TPV or without.
+    Sky {
+        kind: SkyProjection,
         ra: f64,
         dec: f64,
         /// Native longitude of the celestial pole in radians.
@@ -64,39 +64,55 @@ pub(super) enum Projection {
     },
 }
 
-/// How the distance R from the reference point on the plane, in radians, follows from the angle on the sky.
+/// How a place on the plane, in radians, follows from the direction on the sky.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Zenithal {
-    /// TAN: tan θ.
+pub(super) enum SkyProjection {
+    /// TAN: the distance from the reference point is tan θ, θ being the angle on the sky.
     Gnomonic,
     /// STG: 2 tan(θ/2), of coadds for Roman.
     Stereographic,
     /// SIN: sin θ, of 2MASS and WISE.
     Orthographic,
+    /// CAR: longitude and latitude about the reference point, of maps of the whole sky.
+    PlateCarree,
 }
 
-impl Zenithal {
-    /// The height h over the plane that has the direction (ξ, η, h), and its derivative by R² = ξ² + η².
-    fn height(self, square: f64) -> (f64, f64) {
-        match self {
-            Zenithal::Gnomonic => (1.0, 0.0),
-            Zenithal::Stereographic => (1.0 - square / 4.0, -0.25),
-            Zenithal::Orthographic => {
+impl SkyProjection {
+    /// The direction of a place along the axes (reference point, east, north), of any length, and its derivatives by ξ and η.
+    fn direction(self, [xi, eta]: [f64; 2]) -> ([f64; 3], [[f64; 3]; 2]) {
+        let square = xi * xi + eta * eta;
+        // Height over the plane, and its derivative by R².
+        let (height, by_square) = match self {
+            SkyProjection::Gnomonic => (1.0, 0.0),
+            SkyProjection::Stereographic => (1.0 - square / 4.0, -0.25),
+            SkyProjection::Orthographic => {
                 let height = (1.0 - square).sqrt();
                 (height, -0.5 / height)
             }
-        }
+            SkyProjection::PlateCarree => {
+                let ((sine, cosine), (up, out)) = (xi.sin_cos(), eta.sin_cos());
+                let by_xi = [-out * sine, out * cosine, 0.0];
+                let by_eta = [-up * cosine, -up * sine, out];
+                return ([out * cosine, out * sine, up], [by_xi, by_eta]);
+            }
+        };
+        let slope = 2.0 * by_square;
+        let by = [[slope * xi, 1.0, 0.0], [slope * eta, 0.0, 1.0]];
+        ([height, xi, eta], by)
     }
 
-    /// The plane's coordinates in units of those of a unit vector of this height. `None` on the half of the sky that would be
-    /// mirrored onto the plane.
-    fn scale(self, height: f64) -> Option<f64> {
-        match self {
-            Zenithal::Gnomonic if height > 0.0 => Some(1.0 / height),
-            Zenithal::Stereographic if height > -1.0 => Some(2.0 / (1.0 + height)),
-            Zenithal::Orthographic if height > 0.0 => Some(1.0),
-            _ => None,
-        }
+    /// The place of a unit vector with these components. `None` on the half of the sky that would be mirrored onto the plane.
+    fn place(self, [height, east, north]: [f64; 3]) -> Option<[f64; 2]> {
+        let scale = match self {
+            SkyProjection::Gnomonic if height > 0.0 => 1.0 / height,
+            SkyProjection::Stereographic if height > -1.0 => 2.0 / (1.0 + height),
+            SkyProjection::Orthographic if height > 0.0 => 1.0,
+            SkyProjection::PlateCarree => {
+                return Some([east.atan2(height), north.atan2(height.hypot(east))]);
+            }
+            _ => return None,
+        };
+        Some([east * scale, north * scale])
     }
 }
 
@@ -114,7 +130,7 @@ pub(super) struct Map {
 
 impl Map {
     pub(super) fn is_distorted(&self) -> bool {
-        let has_tpv = matches!(self.projection, Projection::Zenithal { tpv: Some(_), .. });
+        let has_tpv = matches!(self.projection, Projection::Sky { tpv: Some(_), .. });
         self.sip.is_some() || has_tpv
     }
 
@@ -131,7 +147,7 @@ impl Map {
         }
         let place = apply(self.matrix, offset);
         match &self.projection {
-            Projection::Zenithal { tpv: Some(tpv), .. } => {
+            Projection::Sky { tpv: Some(tpv), .. } => {
                 let (place, by) = Polynomial::both(tpv, place);
                 (place, product(by, slope))
             }
@@ -157,28 +173,30 @@ impl Map {
     }
 
     // The projection, and the axes of its plane.
-    fn zenithal(&self) -> Option<(&Zenithal, [[f64; 3]; 3])> {
+    fn axes(&self) -> Option<(SkyProjection, [[f64; 3]; 3])> {
         match &self.projection {
             Projection::Plane => None,
-            Projection::Zenithal {
+            Projection::Sky {
                 kind,
                 ra,
                 dec,
                 lonpole,
                 ..
-            } => Some((kind, tangent([*ra, *dec], *lonpole))),
+            } => Some((*kind, tangent([*ra, *dec], *lonpole))),
         }
     }
 
     /// Right ascension and declination in degrees, and the derivatives of (west, north) in arcseconds there.
     pub(super) fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix2) {
         let (place, slope) = self.plane(at);
-        let Some((kind, [centre, east, north])) = self.zenithal() else {
+        let Some((kind, axes)) = self.axes() else {
             return (None, slope);
         };
-        let [xi, eta] = place.map(f64::to_radians);
-        let (height, by_square) = kind.height(xi * xi + eta * eta);
-        let point = [0, 1, 2].map(|k| height * centre[k] + xi * east[k] + eta * north[k]);
+        let (direction, by_place) = kind.direction(place.map(f64::to_radians));
+        let of_axes = |along: [f64; 3]| {
+            [0, 1, 2].map(|k| (0..3).map(|axis| along[axis] * axes[axis][k]).sum::<f64>())
+        };
+        let point = of_axes(direction);
         let length = dot(&point, &point).sqrt();
         let there = [
             point[1].atan2(point[0]).to_degrees().rem_euclid(360.0),
@@ -187,11 +205,8 @@ impl Map {
         // A step on the plane moves the direction by its part across it, which west and north of the place itself
         // measure: towards the poles they turn against the axes at the reference point.
         let [_, its_east, its_north] = tangent(there, std::f64::consts::PI);
-        let steps = [(&east, xi), (&north, eta)];
-        let row = |axis: &[f64; 3]| {
-            let up = dot(axis, &centre) * by_square;
-            steps.map(|(by, at)| (dot(axis, by) + 2.0 * at * up) / length)
-        };
+        let steps = by_place.map(of_axes);
+        let row = |axis: &[f64; 3]| steps.each_ref().map(|step| dot(axis, step) / length);
         let local = [row(&its_east).map(|value| -value), row(&its_north)];
         let scale = ARCSEC_PER_RADIAN * 1f64.to_radians();
         let jacobian = product(local, slope).map(|row| row.map(|value| value * scale));
@@ -200,10 +215,10 @@ impl Map {
 
     /// The pixel of a place on the sky; `None` on its other half, and where the distortion has no inverse.
     pub(super) fn pixel_of(&self, sky: [f64; 2]) -> Option<[f64; 2]> {
-        let (kind, [centre, east, north]) = self.zenithal()?;
+        let (kind, axes) = self.axes()?;
         let [point, ..] = tangent(sky, std::f64::consts::PI);
-        let scale = kind.scale(dot(&point, &centre))?;
-        self.pixel([&east, &north].map(|axis| (dot(&point, axis) * scale).to_degrees()))
+        let place = kind.place(axes.each_ref().map(|axis| dot(&point, axis)))?;
+        self.pixel(place.map(f64::to_degrees))
     }
 }
 
