@@ -12,8 +12,8 @@ use shearq_pipeline::gather::{
 };
 
 type Matrix2 = [[f64; 2]; 2];
-// Arcseconds per pixel, and OVERSAMP.
-type Size = (Option<f64>, Option<f64>);
+// Arcseconds per pixel, pixels of a PSF along a pixel of the galaxies, electrons per unit, and the level of saturation.
+type Size = (Option<f64>, Option<f64>, Option<f64>, Option<f64>);
 // Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, why they are not those of a cube's stamps, the size of pixels, and
 // messages.
 type Images<'py> = (
@@ -33,6 +33,15 @@ fn stacked<'py>(py: Python<'py>, matrices: Vec<Matrix2>) -> PyResult<Bound<'py, 
     let array = ndarray::Array3::from_shape_vec((count, 2, 2), all);
     let array = array.map_err(|error| PyValueError::new_err(error.to_string()))?;
     Ok(array.into_pyarray(py))
+}
+
+fn size_of(size: PixelSize) -> Size {
+    let PixelSize {
+        scale,
+        oversampling,
+        detector,
+    } = size;
+    (scale, oversampling, detector.gain, detector.saturation)
 }
 
 fn matrices(array: &PyReadonlyArray3<'_, f64>) -> Vec<Matrix2> {
@@ -64,7 +73,7 @@ pub(crate) fn read_images<'py>(
     let pixels = ndarray::Array3::from_shape_vec((count, side, side), pixels);
     let pixels = pixels.map_err(|error| PyValueError::new_err(error.to_string()))?;
     let jacobians = jacobians.map(|all| stacked(py, all)).transpose()?;
-    let size = (pixel_size.scale, pixel_size.oversampling);
+    let size = size_of(pixel_size);
     let pixels = pixels.into_pyarray(py);
     Ok((pixels, jacobians, fault_of_cube, size, messages))
 }
@@ -84,22 +93,24 @@ pub(crate) fn header_pixels(
         pixel_size,
         doubts,
     } = HeaderPixels::from_cards(cards, [width, height], planes).map_err(PyValueError::new_err)?;
-    let size = (pixel_size.scale, pixel_size.oversampling);
+    let size = size_of(pixel_size);
     Ok((jacobian, fault_of_cube, size, doubts))
 }
 
 /// The pixels of PSFs along a pixel of galaxies by the sizes that their headers state, and what is wrong with these.
 #[pyfunction]
 pub(crate) fn stated_oversampling(psf: Size, galaxies: Size) -> (Option<usize>, Option<String>) {
-    let (scale, oversampling) = psf;
+    let (scale, oversampling, ..) = psf;
     let size = PixelSize {
         scale,
         oversampling,
+        ..PixelSize::default()
     };
     let stated = size.oversampling_of(galaxies.0);
     let scales = scale.zip(galaxies.0).filter(|_| stated.is_none());
     let found = scales.and_then(|(psf, galaxies)| scale_difference(psf, galaxies));
-    (stated, found.map(|warning| warning.to_string()))
+    let found = found.map(|warning| warning.to_string());
+    (stated, found.or_else(|| size.unused(galaxies.0)))
 }
 
 /// What is wrong with PSFs of these Jacobians for stamps of those.

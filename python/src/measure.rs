@@ -10,9 +10,9 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_catalogue::star_noise::{StarNoise, Stars};
 use shearq_measure::{
-    ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
-    MeanShearError, MeasureError, Measurement, Measurer, Oversampling, PsfProfile, Psfs, Session,
-    ShearSum, Star, Warning,
+    ArraySource, Batch, Detector, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise,
+    MeanShear, MeanShearError, MeasureError, Measurement, Measurer, Oversampling, PsfProfile, Psfs,
+    Session, ShearSum, Star, Warning,
 };
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{
@@ -64,6 +64,8 @@ pub(crate) struct Image<'py> {
     stated: bool,
     jacobians: Option<PyReadonlyArray3<'py, f64>>,
     offsets: Option<PyReadonlyArray2<'py, f64>>,
+    /// Electrons per unit and the level of saturation that the header of the stamps states.
+    detector: (Option<f64>, Option<f64>),
 }
 
 /// The arrays of an image, which its source borrows.
@@ -119,6 +121,8 @@ fn source<'a>(
         move |range| psfs.slice(range).map_err(|error| failed.keep(error)),
         moved,
     );
+    let (gain, saturation) = image.detector;
+    source = source.with_detector(Detector { gain, saturation });
     if is_shared {
         source = source.with_shared_psf();
     }

@@ -358,6 +358,22 @@ def test_oversampled_psfs_are_those_on_galaxy_pixels():
     np.testing.assert_allclose(some["e1"], native["e1"], atol=1e-3)
 
 
+def test_headers_state_units_and_detectors():
+    fits = pytest.importorskip("astropy.io.fits")
+    image = shearq.simulate(set=8, grid=8)[0]
+    for header, message in (
+        ({"BUNIT": "mag"}, "the pixels are magnitudes"),
+        ({"BUNIT": "adu2"}, "the pixels are variances"),
+        ({"GAIN": 10.0}, r"a gain of 10.0 in the header.* changes m by about \+0.00"),
+        ({"SATURATE": 0.5}, "above 0.8 of SATURATE"),
+    ):
+        with pytest.warns(shearq.DataWarning, match=message):
+            shearq.measure(fits.PrimaryHDU(image.stamps, fits.Header(header)), image.psf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shearq.measure(fits.PrimaryHDU(image.stamps, fits.Header({"GAIN": 1000.0, "SATURATE": 1e5})), image.psf)
+
+
 def test_headers_state_sizes_of_pixels(tmp_path):
     fits = pytest.importorskip("astropy.io.fits")
     image = shearq.simulate(set=8, grid=8)[0]
@@ -371,7 +387,13 @@ def test_headers_state_sizes_of_pixels(tmp_path):
             found = shearq.measure(stamps, given, noise=1.0)
         # Files are read in single precision.
         np.testing.assert_allclose(found["e1"], expected["e1"], atol=1e-6)
+    for header in ({"PSF_SAMP": 0.5}, {"SAMPLING": 2.0}):
+        with pytest.warns(shearq.DataWarning, match="PSF_SAMP or SAMPLING of its header"):
+            found = shearq.measure(stamps, fits.PrimaryHDU(fine, fits.Header(header)), noise=1.0)
+        np.testing.assert_allclose(found["e1"], expected["e1"], atol=1e-6)
     native = gaussian_psf(1.45, 48, 1)
+    with pytest.warns(shearq.DataWarning, match="states 1.500 pixels of the PSF"):
+        shearq.measure(stamps, fits.PrimaryHDU(native, fits.Header({"PSF_SAMP": 1 / 1.5})), noise=1.0)
     other = fits.PrimaryHDU(native, fits.Header({"SECPIX": 0.25}))
     with pytest.warns(shearq.DataWarning, match="different pixel scales .found 0.25, expected 0.2 "):
         shearq.measure(stamps, other, noise=1.0)

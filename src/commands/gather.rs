@@ -91,7 +91,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "NAME")]
     psf_extension: Option<String>,
     /// Pixels of the PSF images along a pixel of the galaxies, of undersampled images. The light of the finer pixels is
-    /// integrated over those of the galaxies, without aliases [default: OVERSAMP of the header, or 1].
+    /// integrated over those of the galaxies, without aliases [default: OVERSAMP, PSF_SAMP or SAMPLING of the header, or 1].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=32))]
     psf_oversampling: Option<u8>,
     /// Maps of the variance of each pixel: of the stamps in the same order, or of the exposure. The noise of a galaxy is the median

@@ -98,6 +98,8 @@ const CLIPPED_SHARE: std::ops::RangeInclusive<f64> = 0.02..=0.95;
 const MIN_FLAT_TOP: usize = 3;
 // Share of stamps with a flat top. Chosen by hand.
 const FLAT_TOPS: f64 = 0.05;
+// Of the level of saturation, from which detectors are rarely linear to a per cent. Chosen by hand.
+const NEAR_SATURATION: f64 = 0.8;
 // Share of equal neighbours from which all values repeat, as whole numbers do. Chosen by hand.
 const MAX_EQUAL_SHARE: f64 = 0.005;
 // Noise over the peak below which symmetric galaxies may have equal pixels. Chosen by hand.
@@ -788,6 +790,17 @@ impl Examination {
         (count as f64 > least).then_some(Warning::FlatTops { count, of })
     }
 
+    /// A warning if many stamps come near this value, at which pixels saturate.
+    pub(crate) fn near_saturation(&self, level: f64) -> Option<Warning> {
+        let is_near = |stamp: &&StampStatistics| stamp.peak > NEAR_SATURATION * level;
+        let (count, of) = (
+            self.stamps.iter().filter(is_near).count(),
+            self.stamps.len(),
+        );
+        let is_many = count as f64 > FLAT_TOPS * of as f64;
+        (level > 0.0 && is_many).then_some(Warning::NearSaturation { level, count, of })
+    }
+
     fn noisy(&self) -> impl Iterator<Item = &StampStatistics> {
         let is_noisy = |stamp: &&StampStatistics| {
             stamp.noise[0].hypot(stamp.noise[1]) > MIN_NOISE_TO_PEAK * stamp.peak
@@ -1070,6 +1083,18 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
+/// Sums over lines of products of their levels: of all, of waves of 2 px, and of waves of 4 px.
+fn shared_levels(a: &[f64], b: &[f64]) -> [f64; 3] {
+    let sum = |levels: &[f64], wave: [f64; 4]| {
+        let along = levels.iter().zip(wave.iter().cycle());
+        along.map(|(level, wave)| level * wave).sum::<f64>()
+    };
+    let both = |wave: [f64; 4]| sum(a, wave) * sum(b, wave) / a.len() as f64;
+    let all = a.iter().zip(b).map(|(a, b)| a * b).sum();
+    let four = both([1.0, 0.0, -1.0, 0.0]) + both([0.0, 1.0, 0.0, -1.0]);
+    [all, both([1.0, -1.0, 1.0, -1.0]), 2.0 * four]
+}
+
 /// Pixels nearer to `place` than `radius`: those that are missing, and all.
 fn missing_near(pixels: &[f32], n: usize, place: [f64; 2], radius: f64) -> [usize; 2] {
     let middle = (n as f64 - 1.0) / 2.0;
@@ -1083,18 +1108,6 @@ fn missing_near(pixels: &[f32], n: usize, place: [f64; 2], radius: f64) -> [usiz
     }
     counts
 }
-/// Sums over lines of products of their levels: of all, of waves of 2 px, and of waves of 4 px.
-fn shared_levels(a: &[f64], b: &[f64]) -> [f64; 3] {
-    let sum = |levels: &[f64], wave: [f64; 4]| {
-        let along = levels.iter().zip(wave.iter().cycle());
-        along.map(|(level, wave)| level * wave).sum::<f64>()
-    };
-    let both = |wave: [f64; 4]| sum(a, wave) * sum(b, wave) / a.len() as f64;
-    let all = a.iter().zip(b).map(|(a, b)| a * b).sum();
-    let four = both([1.0, 0.0, -1.0, 0.0]) + both([0.0, 1.0, 0.0, -1.0]);
-    [all, both([1.0, -1.0, 1.0, -1.0]), 2.0 * four]
-}
-
 
 /// A number from the bits of the stamp's pixels.
 fn trace(pixels: &[f32]) -> u64 {

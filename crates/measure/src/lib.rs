@@ -86,8 +86,8 @@ pub use pixels::{Pixel, Pixels};
 pub use psf::{Oversampling, Psfs, Star, Truncation, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
-    ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
-    RowJob, Session, StampRows, StampSource, Threads,
+    ArraySource, Batch, Detector, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow,
+    OneThread, RowJob, Session, StampRows, StampSource, Threads,
 };
 pub use shearq_quantities::{
     Distortion, Frame, FunctionalPsf, Jacobian, JacobianError, PsfProfile, Shear,

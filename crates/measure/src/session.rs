@@ -128,10 +128,24 @@ pub trait StampSource<'a> {
         None
     }
 
+    /// What a header states of the detector, which is compared with the stamps.
+    fn detector(&self) -> Detector {
+        Detector::default()
+    }
+
     /// Whether the pixels have the unit of flux of other epochs, so that a ratio other than 1 is a mistake.
     fn has_common_flux(&self) -> bool {
         true
     }
+}
+
+/// What a header states of the detector.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Detector {
+    /// Electrons per unit of the stamps, without use unless [`StampSource::gain`] has them.
+    pub gain: Option<f64>,
+    /// Pixels of this value and above are saturated.
+    pub saturation: Option<f64>,
 }
 
 /// A value that is made by the first thread that needs it: threads share the drawing of simulated galaxies, although one
@@ -200,6 +214,7 @@ pub struct ArraySource<'a, E = MeasureError> {
     /// One for all stamps or one per stamp.
     jacobians: Option<Cow<'a, [Jacobian]>>,
     offsets: Option<Cow<'a, [[f64; 2]]>>,
+    detector: Detector,
 }
 
 impl<E> fmt::Debug for ArraySource<'_, E> {
@@ -271,7 +286,14 @@ impl<'a, E> ArraySource<'a, E> {
             is_psf_shared: false,
             jacobians: None,
             offsets: None,
+            detector: Detector::default(),
         }
+    }
+
+    /// The same stamps with what their header states of the detector.
+    #[must_use]
+    pub fn with_detector(self, detector: Detector) -> Self {
+        ArraySource { detector, ..self }
     }
 
     /// The same stamps, of which all have one PSF.
@@ -355,6 +377,10 @@ impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
         let range = self.rows().stamps(row);
         Ok(self.offsets.as_deref().map(|each| each[range].to_vec()))
     }
+
+    fn detector(&self) -> Detector {
+        self.detector
+    }
 }
 
 // In pixels along each axis. Chosen by hand.
@@ -375,6 +401,7 @@ pub struct Session<'n> {
     frame: Frame,
     noise: KnownNoise<'n>,
     gain: Option<f64>,
+    detector: Detector,
     common_flux: bool,
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
@@ -516,6 +543,7 @@ impl<'n> Session<'n> {
             frame,
             noise,
             gain: source.gain(),
+            detector: source.detector(),
             common_flux: source.has_common_flux(),
             survey: None,
             stars,
@@ -971,6 +999,8 @@ impl MeasuredImage<'_> {
         let of_galaxies = Warning::of_galaxies(&galaxies);
         let is_known = |one: &Warning| levels_differ && matches!(one, Warning::Empty { .. });
         warnings.extend(of_galaxies.filter(|one| !is_known(one)));
+        let unused_gain = session.detector.gain.filter(|_| session.gain.is_none());
+        warnings.extend(unused_gain.and_then(|gain| Warning::of_poisson(&galaxies, gain)));
         if let Some(mean) = &response
             && !mean.is_significant
             && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())
@@ -1056,6 +1086,8 @@ impl Session<'_> {
         let one_level = self.noise.levels().is_none();
         let found = stamps.warnings().into_iter();
         warnings.extend(found.filter(|one| one_level || !matches!(one, Warning::Depths { .. })));
+        let saturation = self.detector.saturation;
+        warnings.extend(saturation.and_then(|level| stamps.near_saturation(level)));
         let header = self.measurer.configuration().noise == NoiseSource::Header;
         warnings.extend(match &self.noise {
             KnownNoise::Given(level) => stamps.given_noise(*level),

@@ -5,6 +5,7 @@
 use std::fmt;
 
 use shearq_quantities::linear::{Matrix2, determinant, inverse, product};
+use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{hints, tried};
 use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
@@ -265,6 +266,19 @@ pub enum Warning {
     /// The brightest pixels of a stamp have one value, on many stamps.
     #[error("several pixels have the brightest value of their stamp on {count} of {of} stamps (expected one pixel), as if light above it were cut off, which biases shears{}", tried(self.hint()))]
     FlatTops { count: usize, of: usize },
+    /// Many galaxies come near the level at which the header states that pixels saturate.
+    #[error("the brightest pixel of {count} of {of} stamps is above 0.8 of SATURATE of the header, {} (expected fainter galaxies): if the detector's response falls by 5 % there, m changes by about -0.009{}", significant(*level, 5), tried(self.hint()))]
+    NearSaturation { level: f64, count: usize, of: usize },
+    /// The header states a gain, and galaxies have Poisson noise that the noise of the sky lacks.
+    #[error("the noise is that of the sky, without the Poisson noise of the galaxies (found a gain of {} in the header, hence {:.1} electrons of noise per pixel, and a median S/N of {snr:.0}), which changes m by about {m:+.3}{}", significant(*gain, 3), electrons, tried(self.hint()))]
+    PoissonNoise {
+        /// Electrons per unit of the image.
+        gain: f64,
+        /// Noise of a pixel in electrons.
+        electrons: f64,
+        snr: f64,
+        m: f64,
+    },
     /// The noise of the star biases shears.
     #[error(
         "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}{}",
@@ -381,6 +395,12 @@ pub enum Warning {
 // m at S/N 20 by the relative excess v of the given variance, as −v/(1/this + v). 800 galaxies: −0.008, −0.033, −0.088 and −0.19 for a given σ
 // that is 1.05, 1.2, 1.5 and 2 times the true one, +0.007, +0.028 and +0.058 for 0.95, 0.8 and 0.5; a quarter of it at S/N 40.
 const M_BY_GIVEN_VARIANCE: f64 = 0.077;
+// m times the S/N and the noise of a pixel in electrons: docs/survey.md, S/N 30 over 100 and 10 electrons of sky, +0.004 and +0.013.
+const M_BY_POISSON_NOISE: f64 = 1.2;
+// Least m that is stated: what Euclid requires.
+const MIN_POISSON_M: f64 = 0.002;
+// The column `snr` in units of the S/N: docs/limitations.md.
+const SNR_COLUMN: f64 = 0.74;
 // Share of negative fluxes of galaxies at S/N 5, whose column `snr` is 3.7 in the mean.
 const NEGATIVE_AT_SNR_5: f64 = 1e-4;
 // Share of negative fluxes that no galaxies of S/N 2 or more have: their mean column `snr` is 1.5. More are stamps without a galaxy.
@@ -516,6 +536,23 @@ impl Warning {
         (2 * count <= of).then_some(Warning::Empty { count, of })
     }
 
+    /// A warning if the Poisson noise of the galaxies matters, at so many electrons per unit of the image.
+    pub(crate) fn of_poisson(galaxies: &[Measurement], gain: f64) -> Option<Warning> {
+        let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
+        let seen =
+            good.filter_map(|galaxy| Some((galaxy.observables.as_ref()?.snr(), galaxy.noise)));
+        let (mut snr, mut noise): (Vec<f64>, Vec<f64>) = seen.unzip();
+        let snr = upper_median(&mut snr)? / SNR_COLUMN;
+        let electrons = gain * upper_median(&mut noise)?;
+        let m = M_BY_POISSON_NOISE / (snr * electrons);
+        (m > MIN_POISSON_M && m.is_finite()).then_some(Warning::PoissonNoise {
+            gain,
+            electrons,
+            snr,
+            m,
+        })
+    }
+
     fn of_defects(galaxies: &[Measurement]) -> Option<Warning> {
         let mut counts = DefectCounts::default();
         let (mut stamps, mut flagged) = (0, 0);
@@ -587,6 +624,8 @@ impl Warning {
         Self::Defects { .. } => "replace such pixels by NaN, and cut stamps before a deblender fills them",
         Self::Empty { .. } => "check that the positions are those of galaxies on this image",
         Self::Saturated { .. } | Self::FlatTops { .. } => "replace saturated pixels by NaN",
+        Self::NearSaturation { .. } => "an image that is corrected for non-linearity, or such pixels as NaN",
+        Self::PoissonNoise { gain, .. } => &format!("gather --gain {gain}, if this is the gain of the pixels"),
         Self::PeakNormalised { .. } => "stamps in one unit",
         Self::Clipped { .. } => "images whose negative pixels are kept",
         Self::PsfTruncated { .. } => "a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",

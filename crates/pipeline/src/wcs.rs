@@ -3,10 +3,11 @@
 
 mod header;
 mod map;
+mod unit;
 
 use shearq_files::FileError;
 use shearq_files::fits::{ImageReader, Value};
-use shearq_measure::{PixelFrame, Warning};
+use shearq_measure::{Detector, PixelFrame, Warning};
 use shearq_quantities::linear::{Matrix2, determinant, inverse, product};
 
 pub(crate) use self::header::{Keys, Wcs};
@@ -14,9 +15,9 @@ use self::map::{Map, Projection, regular_inverse};
 
 // Keys of the matrix from pixels to the sky.
 const CD_KEYS: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
-// Least relative difference of scales that is reported: it changes m by about as much.
 /// Projections that are read, in the words of messages.
 pub(crate) const READ_PROJECTIONS: &str = "TAN, TAN-SIP, TPV, SIN, STG, CAR or a linear one";
+// Least relative difference of scales that is reported: it changes m by about as much.
 const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
 // Relative difference of the pixels of stamps from those at the reference point, by a distortion, above which stamps without places
 // are refused: it adds as much to c. Chosen by hand: a tenth of what surveys require.
@@ -70,6 +71,15 @@ impl Wcs {
         self.scale
     }
 
+    pub(crate) fn detector(&self) -> Detector {
+        self.detector
+    }
+
+    /// Pixels of a PSF along a pixel of the galaxies.
+    pub(crate) fn oversampling(&self) -> Option<f64> {
+        self.oversampling
+    }
+
     /// Keys that state where the image is in a larger one, if it is a section of one.
     pub(crate) fn section(&self) -> Option<&str> {
         self.section.as_deref()
@@ -107,8 +117,13 @@ impl Wcs {
 
     /// Keys that state the same of an image of other stamps of these pixels, as GalSim writes and reads them.
     pub(crate) fn keys(&self) -> Vec<(&'static str, Value)> {
+        let Detector { gain, saturation } = self.detector;
+        let stated = [("GAIN", gain), ("SATURATE", saturation)];
+        let stated = stated
+            .into_iter()
+            .filter_map(|(key, value)| Some((key, Value::Real(value?))));
         let Some([[xx, xy], [yx, yy]]) = self.reference() else {
-            return Vec::new();
+            return stated.collect();
         };
         let text = |text: &str| Value::Text(text.into());
         // Without a reference point, because the stamps are not where the image of the header had them.
@@ -117,6 +132,7 @@ impl Wcs {
         keys.extend(["CUNIT1", "CUNIT2"].map(|key| (key, text("arcsec"))));
         let matrix = [xx, xy, yx, yy].map(Value::Real);
         keys.extend(CD_KEYS.into_iter().zip(matrix));
+        keys.extend(stated);
         keys
     }
 
@@ -395,6 +411,42 @@ mod tests {
         let keys = CD_KEYS.into_iter().zip(matrix);
         let kind = ("CTYPE1", Value::Text("RA---TAN".into()));
         wcs(&[kind].into_iter().chain(keys).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn headers_state_finer_pixels_and_other_quantities() {
+        let text = |text: &str| Value::Text(text.into());
+        for (key, value, expected) in [
+            ("OVERSAMP", real(4.0), Some(4.0)),
+            ("PSF_SAMP", real(0.5), Some(2.0)),
+            ("PSF_SAMP", real(0.333333), Some(3.0)),
+            ("SAMPLING", real(0.25), Some(4.0)),
+            ("SAMPLING", real(3.0), Some(3.0)),
+            ("SAMPLING", text("point"), None),
+            ("PSF_SAMP", real(0.0), None),
+        ] {
+            assert_eq!(wcs(&[(key, value)]).oversampling, expected, "{key}");
+        }
+        let gain = |unit: &str, gain: f64| {
+            let keys = [
+                ("BUNIT", text(unit)),
+                ("GAIN", real(gain)),
+                ("EXPTIME", real(10.0)),
+            ];
+            let found = wcs(&keys).detector.gain;
+            // What `gather` writes to its images.
+            assert_eq!(wcs(&wcs(&keys).keys()).detector.gain, found);
+            found
+        };
+        assert_eq!(gain("adu", 2.5), Some(2.5));
+        assert_eq!(gain("electron", 2.5), Some(1.0));
+        assert_eq!(gain("ELECTRONS/S", 2.5), Some(10.0));
+        assert_eq!(gain("counts/s", 2.5), Some(25.0));
+        assert_eq!(gain("nJy", 2.5), None);
+        assert_eq!(gain("", 0.0), None);
+        let magnitudes = wcs(&[("BUNIT", text("mag"))]);
+        assert!(magnitudes.doubts()[0].contains("BUNIT = mag"));
+        assert!(wcs(&[("BUNIT", text("adu"))]).doubts().is_empty());
     }
 
     #[test]

@@ -42,9 +42,11 @@ def _of_model(path: str) -> str:
     return next((f". Try: psf={opener}({path!r}), with x= and y=" for card, opener in _MODELS.items() if card in start), "")
 
 
-# What a header states: arcseconds per pixel, and OVERSAMP.
-_Size = tuple[float | None, float | None]
-_NO_SIZE: _Size = (None, None)
+# What a header states: arcseconds per pixel, pixels of a PSF along a pixel of the galaxies, electrons per unit, and the level of saturation.
+_Size = tuple[float | None, float | None, float | None, float | None]
+_NO_SIZE: _Size = (None, None, None, None)
+Detector = tuple[float | None, float | None]
+NO_DETECTOR: Detector = (None, None)
 
 
 def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float64] | None, _Size]:
@@ -90,16 +92,19 @@ def _scale(stamps: Any, wcs: Any) -> float | None:
     return float(np.sqrt(abs(np.linalg.det(matrix.reshape(-1, 2, 2)[0]))))
 
 
-def opened(stamps: Any, psf: Any, wcs: Any, oversampling: int | None) -> tuple[Any, Any, Any, int | None]:
-    """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS and oversampling that are not given."""
+def opened(stamps: Any, psf: Any, wcs: Any, oversampling: int | None) -> tuple[Any, Any, Any, int | None, Detector]:
+    """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS and oversampling that are not given.
+
+    Also what the header of the stamps states of the detector.
+    """
     stamps, own, size = _opened("stamps", stamps, wcs is not None)
     psf, of_psf, psf_size = _opened("psf", psf, wcs is not None)
     stated, fault = None, None
     if psf_size != _NO_SIZE:
-        stated, fault = _shearq.stated_oversampling(psf_size, (_scale(stamps, wcs) or size[0], None))
+        stated, fault = _shearq.stated_oversampling(psf_size, (_scale(stamps, wcs) or size[0], None, None, None))
     if oversampling is None and stated is not None:
         oversampling = stated
-        message = f"psf: has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP of its header states. psf_oversampling=1 ignores that"
+        message = f"psf: has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP, PSF_SAMP or SAMPLING of its header states. psf_oversampling=1 ignores that"
         warn(message, DataWarning)
     is_fine = oversampling not in (None, 1)
     if fault is not None and not is_fine and (own is None or of_psf is None):
@@ -113,4 +118,4 @@ def opened(stamps: Any, psf: Any, wcs: Any, oversampling: int | None) -> tuple[A
         # As `gather` has it: pixels along the axes of the sky need no Jacobians.
         if wcs is None and not _shearq.are_aligned(own):
             wcs = own[0] if len(own) == 1 else own
-    return stamps, psf, wcs, oversampling
+    return stamps, psf, wcs, oversampling, size[2:]

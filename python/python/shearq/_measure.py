@@ -174,7 +174,7 @@ def measure(
         Whether profiles of GalSim contain the pixel, as those interpolated from images of stars do. By default they are convolved
         with it, with a warning for such profiles.
     psf_oversampling : int, optional
-        Pixels of the PSF images along a pixel of the galaxies, of undersampled images; by default OVERSAMP of the header of a path
+        Pixels of the PSF images along a pixel of the galaxies, of undersampled images; by default OVERSAMP, PSF_SAMP or SAMPLING of the header of a path
         or HDU, or 1. The PSFs are integrated over their fine
         pixels, as GalSim and STPSF draw them, and are integrated over the galaxies' pixels here, without aliases.
     submission : str, path, mapping or Configuration
@@ -229,9 +229,9 @@ def measure(
         for name, value in (("stamps", stamps), ("psf", psf)):
             if value is None:
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
-        stamps, psf, wcs = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
+        stamps, psf, wcs, detector = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
         _doubt_mask(mask)
-        return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
+        return _measure([_image(stamps, psf, noise, mask, wcs, x, y, detector)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
     if psf_oversampling not in (None, 1):
         given["psf_oversampling"] = psf_oversampling
@@ -289,7 +289,7 @@ def measure_blocks(
     >>> print(shearq.mean_shear(blocks))
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged, pixel frame)
     """
-    stamps, psf, wcs = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
+    stamps, psf, wcs, detector = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
         stamps = numeric("stamps", stamps)
@@ -322,7 +322,7 @@ def measure_blocks(
             pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
             local = None if wcs is None else wcs[0] if len(wcs) == 1 else wcs[start:end]
             try:
-                image = _image(pixels, one, level, missing, local, *columns[1:])
+                image = _image(pixels, one, level, missing, local, *columns[1:], detector)
                 yield _measure([image], tuple(columns), settings, count, done)
             except ValueError as error:
                 raise ValueError(f"{error} (stamps {start} to {end - 1})") from None
@@ -360,9 +360,9 @@ def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
 
 def _pixels(
     stamps: Any, psf: Any, wcs: Any, x: Any, y: Any, properties: Any, pixel: PixelOfPsf | None, oversampling: int | None
-) -> tuple[Any, Any, Any]:
-    """Stamps and PSFs of all kinds as arrays, or PSFs as formulas, and the WCS, which files may state."""
-    stamps, psf, wcs, oversampling = _images.opened(stamps, psf, wcs, oversampling)
+) -> tuple[Any, Any, Any, _images.Detector]:
+    """Stamps and PSFs of all kinds as arrays, or PSFs as formulas, and the WCS and detector, which files may state."""
+    stamps, psf, wcs, oversampling, detector = _images.opened(stamps, psf, wcs, oversampling)
     fine = oversampling not in (None, 1)
     psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel, fine)
     if fine and _galsim._many(psf, _galsim._is_profile) is not None:
@@ -373,7 +373,7 @@ def _pixels(
     # Models have drawn their PSFs with the pixel.
     of_profiles = None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
     stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and not fine, pixel=of_profiles, wcs=wcs, x=x, y=y)
-    return stamps, _on_galaxy_pixels(psf, oversampling), wcs
+    return stamps, _on_galaxy_pixels(psf, oversampling), wcs, detector
 
 
 # Share of pixels from which a mask is likely the one of good pixels. Chosen by hand: usual masks mark some per cent.
@@ -398,7 +398,7 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         if unknown or "stamps" not in epoch or "psf" not in epoch:
             raise ValueError(f"found {', '.join(epoch)}; expected stamps, psf and perhaps {', '.join(_EPOCH[2:])}")
         own = {name: epoch.get(name) for name in _EPOCH}
-        stamps, psf, wcs = _pixels(*(own[name] for name in ("stamps", "psf", "wcs", "x", "y", "properties", "pixel", "psf_oversampling")))
+        stamps, psf, wcs, _ = _pixels(*(own[name] for name in ("stamps", "psf", "wcs", "x", "y", "properties", "pixel", "psf_oversampling")))
         noise = own["noise"]
         if own["flux"] is not None:
             flux = np.asarray(own["flux"], dtype=np.float64)
@@ -459,7 +459,9 @@ def _levels(stamps: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[Any], N
     return stamps, np.where(np.isnan(levels), known[len(known) // 2] if len(known) else 0.0, levels)
 
 
-def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: Any) -> dict[str, Any]:
+def _image(
+    stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: Any, detector: _images.Detector = _images.NO_DETECTOR
+) -> dict[str, Any]:
     """The arrays of an image as the extension module takes them."""
     stamps = with_missing("stamps", stamps, mask)
     stamps = shaped("stamps", stamps, "(n, ny, nx), of one stamp stamps[np.newaxis]", axes=3)
@@ -469,6 +471,7 @@ def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: An
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
     image: dict[str, Any] = dict.fromkeys(("star", "stars", "formulas", "noise", "noises", "offsets"))
     image["stated"] = False
+    image["detector"] = detector
     image["stamps"] = stamps
     image["jacobians"] = None if wcs is None else jacobians(wcs, count, x, y, sides)
     if isinstance(psf, FunctionalPsf):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _Doubles = NDArray[np.float64]
-_Size = tuple[float | None, float | None]
+_Size = tuple[float | None, float | None, float | None, float | None]
 
 __version__: str
 version_and_commit: str

@@ -406,6 +406,10 @@ fn warnings_about_stamps_begin_at_their_limits() {
         examined(|_, stamp| stamp.bands = [0.01, 0.01 / ratio].map(|all| [all, 0.0, 0.0]))
             .warnings()
     });
+    begins_at(0.8, "near-saturation", |peak| {
+        let found = examined(|_, stamp| stamp.peak = peak);
+        found.near_saturation(1.0).into_iter().collect()
+    });
     // Half of the correlation.
     begins_at(0.5, "sky-levels", |share| {
         let levels = (share * 0.1_f64).sqrt();
@@ -613,10 +617,6 @@ fn bands_and_skies_of_stamps_are_named() {
         kinds(&|[_, _, x], [_, columns, _]| 0.2 * columns[x]),
         "found columns with",
     );
-    for scatter in [0.3, 0.9, 3.0] {
-        one(
-            kinds(&|_, [.., sky]| scatter * sky[0]),
-            "noise.sky = \"stamp\"",
     // Levels of odd and even columns have the other sign of c1, and an m; those of rows the opposite c1.
     let alternate = |at: usize| if at.is_multiple_of(2) { 0.2 } else { -0.2 };
     one(kinds(&|[.., x], _| alternate(x)), "c1 by about +0.003");
@@ -624,6 +624,10 @@ fn bands_and_skies_of_stamps_are_named() {
     one(kinds(&|[_, y, _], _| alternate(y)), "c1 by about -0.003");
     let two_and_two = |at: usize| if at % 4 < 2 { 0.2 } else { -0.2 };
     one(kinds(&|[.., x], _| two_and_two(x)), "m by about -0.01");
+    for scatter in [0.3, 0.9, 3.0] {
+        one(
+            kinds(&|_, [.., sky]| scatter * sky[0]),
+            "noise.sky = \"stamp\"",
         );
     }
     // Straight gradients along one axis are no bands.

@@ -80,8 +80,6 @@ impl HeaderPixels {
         sides: [usize; 2],
         planes: usize,
     ) -> Result<Self, String> {
-        // Elsewhere the key may be a text.
-        let oversampling = cards.get("OVERSAMP").and_then(|value| value.parse().ok());
         let wcs = Wcs::of_keys(&Keys::new(cards));
         let middle = sides.map(|side| (side as f64 + 1.0) / 2.0);
         match wcs.fault() {
@@ -89,10 +87,7 @@ impl HeaderPixels {
             None => Ok(HeaderPixels {
                 jacobian: wcs.jacobian(middle),
                 fault_of_cube: wcs.fault_of_cube(planes, middle),
-                pixel_size: PixelSize {
-                    scale: wcs.scale(),
-                    oversampling,
-                },
+                pixel_size: PixelSize::of_wcs(&wcs),
                 doubts: wcs.doubts().to_vec(),
             }),
         }

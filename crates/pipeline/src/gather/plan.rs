@@ -9,6 +9,7 @@ use shearq_files::frames::polars::Column;
 use shearq_files::table::MAX_ROWS;
 use shearq_files::table::Place;
 use shearq_files::{FileError, names_of};
+use shearq_measure::Detector;
 use shearq_quantities::linear::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
@@ -136,12 +137,12 @@ impl Plan {
             );
             return Err(fault(&message).hint(PIXEL_AXES));
         }
-        for (row, jacobian) in all.iter().enumerate() {
         // Pixels that are already along the sky need no Jacobians, which take time in each measurement.
         let plain = all.iter().all(aligned);
         if plain && frame.is_none() {
             return Ok(None);
         }
+        for (row, jacobian) in all.iter().enumerate() {
             if let Err(error) = Jacobian::new(*jacobian) {
                 let row = row + 1;
                 let message = format!("the WCS has no inverse at stamp {row}: {error}");
@@ -248,7 +249,6 @@ impl Plan {
                 of_images: Vec::new(),
                 differs: None,
                 fault_of_cube: None,
-                oversampling: None,
             },
             kept: vec![true; inside.len()],
             inside,
@@ -269,8 +269,6 @@ pub(super) struct Stack {
     pub(super) differs: Option<String>,
     /// What is wrong with the WCS of cubes.
     pub(super) fault_of_cube: Option<String>,
-    /// OVERSAMP of the first header.
-    oversampling: Option<f64>,
 }
 
 /// What a header states of the size of its pixels.
@@ -278,11 +276,29 @@ pub(super) struct Stack {
 pub struct PixelSize {
     /// In arcseconds.
     pub scale: Option<f64>,
-    /// OVERSAMP, by which STPSF and WebbPSF state pixels of a PSF along a detector's.
+    /// Pixels of a PSF along one of the galaxies: OVERSAMP of STPSF and WebbPSF, the inverse of PSF_SAMP of PSFEx, or either of SAMPLING.
     pub oversampling: Option<f64>,
+    /// Of the image that has these pixels.
+    pub detector: Detector,
 }
 
 impl PixelSize {
+    pub(super) fn of_wcs(wcs: &Wcs) -> Self {
+        PixelSize {
+            scale: wcs.scale(),
+            oversampling: wcs.oversampling(),
+            detector: wcs.detector(),
+        }
+    }
+
+    /// What is said of a sampling that cannot be used, if the scales do not state the sampling, too.
+    pub fn unused(&self, galaxies: Option<f64>) -> Option<String> {
+        let stated = self.oversampling.filter(|stated| *stated != 1.0)?;
+        let is_unused =
+            self.scale.and(galaxies).is_none() && self.oversampling_of(galaxies).is_none();
+        is_unused.then(|| format!("the header states {stated:.3} pixels of the PSF along a pixel of the galaxies (found OVERSAMP, PSF_SAMP or SAMPLING, expected a whole number of 1 to {MAX_OVERSAMPLING}), which is not used. A PSF of other pixels biases m by 1.3 times the relative difference or more. Try: resample the PSF to the pixels of the galaxies"))
+    }
+
     /// The pixels of PSFs along a pixel of galaxies of this scale, unless the scales contradict it.
     pub fn oversampling_of(&self, galaxies: Option<f64>) -> Option<usize> {
         let stated = self
@@ -298,10 +314,7 @@ impl PixelSize {
 impl Stack {
     /// What the first header states of the size of pixels.
     pub(super) fn pixel_size(&self) -> PixelSize {
-        PixelSize {
-            scale: self.wcs.scale(),
-            oversampling: self.oversampling,
-        }
+        PixelSize::of_wcs(&self.wcs)
     }
 
     /// Jacobians of the stamps.
@@ -317,7 +330,6 @@ impl Stack {
     ) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
         let (mut of_images, mut differs, mut fault_of_cube) = (Vec::new(), None, None);
-        let mut oversampling = None;
         let mut sides = [0; 2];
         let mut images = Images::of(files);
         while let Some((origin, image)) = images.next()? {
@@ -343,8 +355,6 @@ impl Stack {
             };
             let wcs = Wcs::of_header(image)?;
             if first.is_none() {
-                // Elsewhere the key may be a text.
-                oversampling = image.number("OVERSAMP").ok().flatten();
                 messages.extend(doubts(origin.file, &wcs));
                 messages.extend(image.is_asinh().then(|| asinh_line(origin.file)));
                 messages.extend(image.differs_from_datasum()?.then(|| sum_line(origin.file)));
@@ -397,7 +407,6 @@ impl Stack {
             of_images,
             differs,
             fault_of_cube,
-            oversampling,
         };
         Ok((stack, messages))
     }

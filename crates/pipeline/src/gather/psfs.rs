@@ -70,17 +70,9 @@ pub(super) fn gather_psfs(
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
     let (stack, mut messages) = Stack::of(files, square)?;
-    let stated = stack.pixel_size().oversampling_of(plan.stack.wcs.scale());
-    let oversampling = match (gathering.psf_oversampling, stated) {
-        (None, Some(stated)) => {
-            messages.push(format!(
-                "note: {}: the PSF has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP of its header states. --psf-oversampling 1 ignores that",
-                files.paths[0].display()
-            ));
-            stated
-        }
-        _ => oversampling,
-    };
+    let path = &files.paths[0];
+    let (oversampling, message) = oversampling_of(gathering, &stack, plan, path);
+    messages.extend(message);
     let (count, fine) = (stack.count, stack.side);
     let side = fine / oversampling;
     // Headers of finer pixels state another scale.
@@ -140,6 +132,31 @@ pub(super) fn gather_psfs(
         }
     }
     Ok(writer.gathered(&files.paths[0], messages, wcs, pixels_of_all))
+}
+
+/// The pixels of PSFs along a pixel of the galaxies, as the option or else the header states them, and what is said of the header.
+fn oversampling_of(
+    gathering: &Gathering<'_>,
+    psfs: &Stack,
+    plan: &Plan,
+    path: &Path,
+) -> (usize, Option<String>) {
+    if let Some(given) = gathering.psf_oversampling {
+        return (given, None);
+    }
+    let (size, scale, path) = (psfs.pixel_size(), plan.stack.wcs.scale(), path.display());
+    match size.oversampling_of(scale) {
+        Some(stated) => {
+            let note = format!(
+                "note: {path}: the PSF has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP, PSF_SAMP or SAMPLING of its header states. --psf-oversampling 1 ignores that"
+            );
+            (stated, Some(note))
+        }
+        None => {
+            let unused = size.unused(scale);
+            (1, unused.map(|text| format!("warning: {path}: {text}")))
+        }
+    }
 }
 
 /// The PSFs of a model at the galaxies, on pixels that have the size of the stamps.

@@ -11,8 +11,8 @@ use shearq_files::fits::ImageReader;
 use shearq_files::open::is_there;
 use shearq_files::table::numbers;
 use shearq_measure::{
-    FunctionalPsf, KnownNoise, Lazy, LazyStamps, MeasureError, Measurer, Pixels, Psfs, Session,
-    StampRows, StampSource, Star, Threads, Warning,
+    Detector, FunctionalPsf, KnownNoise, Lazy, LazyStamps, MeasureError, Measurer, Pixels, Psfs,
+    Session, StampRows, StampSource, Star, Threads, Warning,
 };
 use shearq_quantities::Jacobian;
 use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
@@ -39,6 +39,7 @@ pub struct ImageSource {
     pub(super) table: Option<StampTable>,
     jacobians: Option<Vec<Jacobian>>,
     gain: Option<f64>,
+    detector: Detector,
     pub(super) aligned: bool,
     warnings: Vec<Warning>,
     rows: StampRows,
@@ -117,6 +118,7 @@ impl ImageSource {
             psfs,
             noise,
             gain: table.as_ref().and_then(|table| table.head.gain),
+            detector: wcs.detector(),
             table,
             jacobians,
             aligned,
@@ -218,6 +220,10 @@ impl StampSource<'static> for ImageSource {
 
     fn gain(&self) -> Option<f64> {
         self.gain
+    }
+
+    fn detector(&self) -> Detector {
+        self.detector
     }
 
     fn has_common_flux(&self) -> bool {

@@ -4,14 +4,23 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 
 use shearq_files::names_of;
+use shearq_measure::Detector;
 use shearq_quantities::linear::{Matrix2, determinant};
 
 use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection, SkyProjection};
+use super::unit::other_than_light;
 
 // Keys with the pixel scale in arcseconds: of surveys, of GalSim and of STPSF.
 const PIXEL_SCALE_KEYS: [&str; 3] = ["PIXSCALE", "GS_SCALE", "PIXELSCL"];
 // The same of observatories. Elsewhere PSCALE is the scale of a plate, so that a WCS comes first.
 const OTHER_SCALE_KEYS: [&str; 3] = ["PIXSCAL1", "SECPIX", "PSCALE"];
+// Keys of the pixels of a PSF along one of the galaxies: of STPSF and WebbPSF. PSFEx states the inverse, and programs disagree on SAMPLING.
+const OVERSAMPLING_KEY: &str = "OVERSAMP";
+const STEP_KEYS: [&str; 2] = ["PSF_SAMP", "SAMPLING"];
+// Keys of electrons per ADU.
+const GAIN_KEYS: [&str; 2] = ["GAIN", "EGAIN"];
+// Rounding of the inverse of such a step.
+const MAX_STEP_ROUNDING: f64 = 1e-4;
 // Largest order of SIP (Shupe et al. 2005, ASPC 347, 491): headers with more are damaged.
 const MAX_SIP_ORDER: i32 = 9;
 // Largest number of a coefficient PVi_m of TPV.
@@ -106,6 +115,56 @@ impl Keys {
         let is_there = found.iter().flatten().any(Option::is_some);
         let absent = |i, j| if i == j { diagonal } else { 0.0 };
         is_there.then(|| [0, 1].map(|i| [0, 1].map(|j| found[i][j].unwrap_or(absent(i, j)))))
+    }
+
+    /// Pixels of a PSF along a pixel of the galaxies. Elsewhere the keys may be texts.
+    fn oversampling(&self) -> Option<f64> {
+        let number = |key: &str| self.values.get(key)?.parse::<f64>().ok();
+        let of_step = |step: f64| match step > 1.0 {
+            true => step,
+            false => 1.0 / step,
+        };
+        let stated = number(OVERSAMPLING_KEY);
+        let stated = stated.or_else(|| STEP_KEYS.into_iter().find_map(number).map(of_step));
+        let stated = stated.filter(|stated| stated.is_finite())?;
+        let is_rounded = (stated - stated.round()).abs() < MAX_STEP_ROUNDING * stated;
+        Some(if is_rounded { stated.round() } else { stated })
+    }
+
+    /// Electrons per unit of the pixels, and the value of saturated ones.
+    fn detector(&self) -> Detector {
+        let number = |key: &str| {
+            let value = self.values.get(key)?.parse::<f64>().ok()?;
+            (value > 0.0 && value.is_finite()).then_some(value)
+        };
+        let unit = self.text("BUNIT");
+        let (unit, is_rate) = match unit.split_once('/') {
+            Some((unit, "S" | "SEC" | "SECOND")) => (unit, true),
+            Some(_) => return Detector::default(),
+            None => (unit.as_str(), false),
+        };
+        let gain = match unit.trim() {
+            "ELECTRON" | "ELECTRONS" | "E" | "E-" => Some(1.0),
+            "" | "ADU" | "DN" | "COUNT" | "COUNTS" => GAIN_KEYS.into_iter().find_map(number),
+            _ => None,
+        };
+        let time = if is_rate {
+            number("EXPTIME")
+        } else {
+            Some(1.0)
+        };
+        Detector {
+            gain: gain.zip(time).map(|(gain, time)| gain * time),
+            saturation: number("SATURATE").filter(|_| !is_rate),
+        }
+    }
+
+    /// What is said of pixels that are no light.
+    fn unit_text(&self) -> Option<String> {
+        let unit = self.values.get("BUNIT")?.trim_matches('\'').trim();
+        other_than_light(unit).map(|found| {
+            format!("the pixels are {found} (found BUNIT = {unit}; expected a unit of light, such as adu or electron), whose shapes are not those of the light. Try: the image of the light, or convert the pixels")
+        })
     }
 
     /// The keys that state where the image is in a larger one.
@@ -217,14 +276,20 @@ pub(crate) struct Wcs {
     pub(super) doubts: Vec<String>,
     /// Keys that state where the image is in a larger one.
     pub(super) section: Option<String>,
+    pub(super) detector: Detector,
+    /// Pixels of a PSF along a pixel of the galaxies.
+    pub(super) oversampling: Option<f64>,
 }
 
 impl Wcs {
     pub(crate) fn of_keys(keys: &Keys) -> Self {
-        let wcs = Wcs {
+        let mut wcs = Wcs {
             section: keys.section(),
+            detector: keys.detector(),
+            oversampling: keys.oversampling(),
             ..Wcs::of_readable(keys)
         };
+        wcs.doubts.extend(keys.unit_text());
         let unreadable = keys.unreadable.borrow().clone();
         // Without this key, the others would place galaxies elsewhere on the sky.
         match unreadable {
@@ -241,6 +306,8 @@ impl Wcs {
             scale: self.scale,
             damage: Some(damage),
             section: self.section,
+            detector: self.detector,
+            oversampling: self.oversampling,
             ..Wcs::default()
         }
     }
@@ -338,7 +405,6 @@ impl Wcs {
                     projection: Projection::Plane,
                 }),
                 unread: named.then(|| kind.to_owned()),
-                damage: None,
                 // Of projections that are not read, none is.
                 doubts: match named {
                     true => Vec::new(),
@@ -350,7 +416,7 @@ impl Wcs {
                             .collect()
                     }
                 },
-                section: None,
+                ..Wcs::default()
             };
         };
         let degrees = |row: [f64; 2]| row.map(|value| value / 3600.0);
@@ -396,12 +462,25 @@ impl Wcs {
                     tpv,
                 },
             }),
-            unread: None,
-            damage: None,
             doubts,
-            section: None,
+            ..Wcs::default()
         }
     }
+}
+
+/// Whether north is up at the reference point of CAR, as it is by default: native longitudes of the pole other than 0 for northern
+/// points and 180° for southern ones have no solution, or turn the sphere (Calabretta & Greisen 2002, eq. 8 to 10).
+fn is_upright(keys: &Keys, dec: f64) -> bool {
+    let of = |key: &str, default: f64| keys.number(key).unwrap_or(default);
+    let up = match of("LONPOLE", if dec >= 0.0 { 0.0 } else { 180.0 }) {
+        0.0 => dec >= 0.0,
+        180.0 => dec <= 0.0,
+        _ => false,
+    };
+    let moved = [
+        "PV1_1", "PV1_2", "PV1_3", "PV1_4", "PV2_1", "PV2_2", "PV2_3", "PV2_4",
+    ];
+    up && of("LATPOLE", 90.0) >= 0.0 && !moved.iter().any(|key| keys.has(key))
 }
 
 /// The matrix from pixels to the units of the axes. A header of zeros has none.
@@ -468,21 +547,6 @@ fn scaled(keys: &Keys, latitude: usize) -> Option<(Matrix2, bool)> {
 
 struct Distortion {
     sip: Option<[Polynomial; 2]>,
-/// Whether north is up at the reference point of CAR, as it is by default: native longitudes of the pole other than 0 for northern
-/// points and 180° for southern ones have no solution, or turn the sphere (Calabretta & Greisen 2002, eq. 8 to 10).
-fn is_upright(keys: &Keys, dec: f64) -> bool {
-    let of = |key: &str, default: f64| keys.number(key).unwrap_or(default);
-    let up = match of("LONPOLE", if dec >= 0.0 { 0.0 } else { 180.0 }) {
-        0.0 => dec >= 0.0,
-        180.0 => dec <= 0.0,
-        _ => false,
-    };
-    let moved = [
-        "PV1_1", "PV1_2", "PV1_3", "PV1_4", "PV2_1", "PV2_2", "PV2_3", "PV2_4",
-    ];
-    up && of("LATPOLE", 90.0) >= 0.0 && !moved.iter().any(|key| keys.has(key))
-}
-
     tpv: Option<[Polynomial; 2]>,
     doubts: Vec<String>,
 }
