@@ -1,6 +1,6 @@
 //! Linear functionals of the deconvolved image about a pixel, their changes with shear, and the covariances of their noise.
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::ArrayView2;
 use shearq_measure::StampNoise;
 use shearq_quantities::PixelShape;
 use shearq_quantities::fourier::{Complex64, Planner64};
@@ -248,52 +248,6 @@ pub(crate) fn light_filters(
     filters
 }
 
-/// For each mode, the wave vector in radians per pixel that is turned by 90 degrees on the sky, and one over the power of the star there;
-/// zero where it has none.
-fn turned_powers(
-    star: ArrayView2<'_, f64>,
-    pixels: PixelShape,
-    transform: &SquareTransform,
-) -> Vec<([f64; 2], f64)> {
-    if pixels.is_square() {
-        let inverse = inverse_transfer(turned(star).view(), transform);
-        let waves = transform.waves().map(|k| [k[1], -k[0]]);
-        return waves.zip(inverse.iter().map(Complex64::norm_sqr)).collect();
-    }
-    // Between the modes of a transform.
-    let sum = star.sum();
-    let power = |[kx, ky]: [f64; 2]| {
-        let phases = |k: f64, count: usize| -> Vec<Complex64> {
-            (0..count)
-                .map(|at| Complex64::cis(-k * at as f64))
-                .collect()
-        };
-        let (along, across) = (phases(kx, star.ncols()), phases(ky, star.nrows()));
-        let rows = star.rows().into_iter().zip(&across).map(|(row, phase)| {
-            let row = row.iter().zip(&along).map(|(value, phase)| phase * *value);
-            row.sum::<Complex64>() * phase
-        });
-        rows.sum::<Complex64>().norm() / sum
-    };
-    let turn = |k: [f64; 2]| {
-        let [kx, ky] = Wave::new(k, pixels).k;
-        let (kx, ky) = (ky, -kx);
-        [pixels.stretch * kx, pixels.skew * kx + ky / pixels.stretch]
-    };
-    let at = |k: [f64; 2]| {
-        let power = power(k);
-        (
-            k,
-            if power > MIN_TRANSFER {
-                power.powi(-2)
-            } else {
-                0.0
-            },
-        )
-    };
-    transform.waves().map(|k| at(turn(k))).collect()
-}
-
 /// The kernels of all functionals, and the covariances of their noise.
 #[derive(Debug)]
 pub(crate) struct Functionals {
@@ -370,14 +324,7 @@ impl Functionals {
                 }
             }
         }
-        for (filters, (k, inverse)) in filters.iter().zip(turned_powers(star, pixels, &transform)) {
-            let power = power(k) * inverse;
-            for a in 0..COUNT {
-                for b in 0..COUNT {
-                    covariances.turned[a][b] += power * (filters[a][0] * filters[b][0].conj()).re;
-                }
-            }
-        }
+        covariances.turned = turned(&covariances.plain);
         Functionals {
             kernels,
             covariances,
@@ -385,63 +332,60 @@ impl Functionals {
     }
 }
 
-/// A star turned by 90 degrees about the centre of its stamp.
-fn turned(star: ArrayView2<'_, f64>) -> Array2<f64> {
-    let mut out = star.reversed_axes();
-    out.invert_axis(ndarray::Axis(0));
-    out.to_owned()
+/// Covariances behind a PSF and of noise that are turned by 90 degrees on the sky: those of turned functionals, among which neighbours change
+/// places and M₂₂ its sign.
+fn turned(plain: &Square) -> Square {
+    // Of (d, 0), (−d, 0), (0, d) and (0, −d).
+    const OTHER: [usize; COUNT] = {
+        let [right, left, up, down] = [EXCESS, EXCESS + 1, EXCESS + 2, EXCESS + 3];
+        [LIGHT, down, up, right, left, M00, M22, M22 + 1]
+    };
+    let sign = |a: usize| if a < M22 { 1.0 } else { -1.0 };
+    let of = |a: usize, b: usize| sign(a) * sign(b) * plain[OTHER[a]][OTHER[b]];
+    std::array::from_fn(|a| std::array::from_fn(|b| of(a, b)))
 }
 
 #[cfg(test)]
 mod tests {
+    use ndarray::Array2;
+
     use super::*;
     use crate::testing::close;
 
-    #[test]
-    fn powers_between_modes_are_those_at_them() {
-        let star = Array2::from_shape_fn((32, 32), |(y, x)| {
-            let [x, y] = [x as f64 - 15.5, y as f64 - 15.5];
-            (-0.5 * (x * x / 3.0 + y * y / 2.0 + 0.2 * x * y)).exp()
+    // Covariances behind a star that is a Gaussian on the sky, of white noise.
+    fn covariances([xx, yy, xy]: [f64; 3], pixels: PixelShape) -> Covariances {
+        let star = Array2::from_shape_fn((48, 48), |(y, x)| {
+            let [u, v] = pixels.map([x as f64 - 23.5, y as f64 - 23.5]);
+            (-0.5 * (u * u / xx + v * v / yy + 2.0 * xy * u * v)).exp()
         });
-        let transform = SquareTransform::new(64);
-        // Not square, by less than anything depends on.
-        let pixels = PixelShape {
-            stretch: 1.0 + 1e-6,
-            skew: 1e-6,
+        let lengths = Lengths {
+            detection_sigma: 2.4,
+            moment_sigma: 3.0,
+            distance: 3,
         };
-        let at_modes = turned_powers(star.view(), PixelShape::SQUARE, &transform);
-        let between = turned_powers(star.view(), pixels, &transform);
-        for ((k, own), (other, found)) in at_modes.iter().zip(&between) {
-            let largest = k[0].abs().max(k[1].abs());
-            // Beyond it, powers are rounding.
-            if largest < 1.5 {
-                close(other[0], k[0], 1e-5);
-                close(other[1], k[1], 1e-5);
-                close(found / own, 1.0, 1e-4);
-            }
-        }
+        Functionals::new(star.view(), &StampNoise::white(1.0), &lengths, pixels, 12).covariances
     }
 
     #[test]
-    fn a_star_that_is_round_on_the_sky_has_the_same_power_if_it_is_turned() {
-        let pixels = PixelShape {
-            stretch: 1.1,
-            skew: 0.2,
-        };
-        let star = Array2::from_shape_fn((48, 48), |(y, x)| {
-            let [u, v] = pixels.map([x as f64 - 23.5, y as f64 - 23.5]);
-            (-0.5 * (u * u + v * v) / 3.0).exp()
-        });
-        let transform = SquareTransform::new(64);
-        let turned = turned_powers(star.view(), pixels, &transform);
-        for (k, (other, found)) in transform.waves().zip(turned) {
-            let [own, other] = [k, other].map(|k| Wave::new(k, pixels));
-            close(other.square, own.square, 1e-12);
-            close(own.k[0] * other.k[0] + own.k[1] * other.k[1], 0.0, 1e-12);
-            if own.square < 2.0 {
-                // That of a Gaussian of 3 px²; aliases are fainter by 10⁻⁵.
-                close(found / (3.0 * own.square).exp(), 1.0, 1e-4);
+    fn covariances_behind_a_turned_star_are_those_of_turned_functionals() {
+        for pixels in [
+            PixelShape::SQUARE,
+            PixelShape {
+                stretch: 1.1,
+                skew: 0.2,
+            },
+        ] {
+            let own = covariances([3.0, 2.4, 0.05], pixels);
+            let other = covariances([2.4, 3.0, -0.05], pixels);
+            for a in 0..COUNT {
+                let error = |b: usize| 1e-5 * (own.plain[a][a] * own.plain[b][b]).sqrt();
+                for b in 0..COUNT {
+                    close(own.turned[a][b], other.plain[a][b], error(b));
+                }
             }
+            // The star has a shape.
+            let product = own.plain[M00][M22].powi(2) / (own.plain[M00][M00] * own.plain[M22][M22]);
+            assert!(product > 1e-4, "{product}");
         }
     }
 }
