@@ -104,6 +104,10 @@ struct SceneArguments {
     /// Ellipticity ε of the PSF of a scene [default: 0.03,-0.02].
     #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_shape: Option<[f64; 2]>,
+    /// Change of the PSF over a scene, of which model.psf is a model as PSFEx has it: relative, of the FWHM from the middle to the right
+    /// edge, and of the ellipticity, of e1 on that way and of e2 to the upper edge.
+    #[arg(long, value_name = "FWHM,E", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
+    psf_gradient: Option<[f64; 2]>,
     /// Galaxies per arcmin².
     #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().density)]
     density: f64,
@@ -304,6 +308,7 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
         pixel_arcsec: own.pixel,
         seeing_arcsec: own.seeing,
         psf_shape: own.psf_shape.unwrap_or(default.psf_shape),
+        psf_gradient: own.psf_gradient.unwrap_or(default.psf_gradient),
         layout: own.layout,
         density: own.density,
         snr: own.snr.unwrap_or(default.snr),

@@ -14,4 +14,4 @@ pub use read::{
     read_vector, tables,
 };
 pub use selection::{ImageHead, Planes, Selection, image_heads};
-pub use write::{ImageWriter, Value, write_table};
+pub use write::{ImageWriter, Value, write_table, write_vector};

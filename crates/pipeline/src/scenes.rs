@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use shearq_dataset::layout::fill;
 use shearq_dataset::run::{SIMULATION_FILE, claim};
 use shearq_dataset::threads::Progress;
-use shearq_files::fits::{ImageWriter, Value};
+use shearq_files::fits::{ImageWriter, Value, write_vector};
 use shearq_files::{FileError, atomic};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::scene::{STAR, SceneSettings, SceneSimulator, Source, Stamp};
@@ -24,6 +24,8 @@ use super::wcs::{Keys, Wcs};
 pub const SCENE: &str = "scene-{image:03}.fits";
 const TRUTH: &str = "truth-{image:03}.csv";
 pub const STAR_FILE: &str = "psf.fits";
+// A PSF that varies, as PSFEx has it.
+const MODEL_FILE: &str = "model.psf";
 /// The shear of each scene, for `bias --truth`.
 pub const SHEARS: &str = "shears.csv";
 
@@ -196,7 +198,38 @@ fn write_star(
     header.push(creator(record));
     let mut writer = ImageWriter::create(out.join(STAR_FILE), STAR, STAR, &header)?;
     writer.write_rows(&simulator.star().into_raw_vec_and_offset().0)?;
-    writer.finish()
+    writer.finish()?;
+    if record.settings.psf_gradient == [0.0; 2] {
+        return Ok(());
+    }
+    let terms = simulator.star_terms();
+    let side = STAR + 1;
+    let count = terms.len() / (side * side);
+    let text = |text: &str| Value::Text(text.into());
+    let whole = |number: usize| Value::Int(number as i64);
+    let scene = record.settings.side as f64;
+    let [middle, scale] = [0.5 * (scene + 1.0), scene].map(Value::Real);
+    let keys = [
+        ("TDIM1", text(&format!("({side},{side},{count})"))),
+        ("POLNAXIS", whole(2)),
+        ("POLNGRP", whole(1)),
+        ("POLGRP1", whole(1)),
+        ("POLGRP2", whole(1)),
+        ("POLNAME1", text("X_IMAGE")),
+        ("POLNAME2", text("Y_IMAGE")),
+        ("POLZERO1", middle.clone()),
+        ("POLZERO2", middle),
+        ("POLSCAL1", scale.clone()),
+        ("POLSCAL2", scale),
+        ("POLDEG1", whole(2)),
+        ("PSF_SAMP", Value::Real(1.0)),
+        ("PSFNAXIS", whole(3)),
+        ("PSFAXIS1", whole(side)),
+        ("PSFAXIS2", whole(side)),
+        ("PSFAXIS3", whole(count)),
+        creator(record),
+    ];
+    write_vector(&out.join(MODEL_FILE), "PSF_MASK", terms, &keys)
 }
 
 /// Writes the shears of scenes 1 to `scenes` of each version for `bias --truth`, by names that catalogues may have as files or

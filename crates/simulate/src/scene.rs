@@ -2,7 +2,8 @@
 //!
 //! A scene has one reduced shear. It acts on the shapes of the galaxies *and on their places*, about the centre of the field, as
 //! lensing does: a detection near a neighbour is lost or gained by how far apart the shear moves them, and such a bias is absent
-//! from galaxies whose places are fixed. Stars are not sheared, and all objects are behind one PSF.
+//! from galaxies whose places are fixed. Stars are not sheared, and all objects are behind one PSF, or one that varies
+//! over the scene.
 //!
 //! Pixels count from 0 here, +x is to the west and +y to the north, so that pixel axes are those of the sky.
 //!
@@ -17,7 +18,9 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::apply;
-use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
+use shearq_quantities::{
+    FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Shear, TransformedPsf,
+};
 
 use super::field::{MAX_RANDOM_SHEAR, random_shear};
 use super::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
@@ -89,6 +92,10 @@ pub struct SceneSettings {
     pub seeing_arcsec: f64,
     /// Ellipticity ε of the PSF.
     pub psf_shape: [f64; 2],
+    /// Relative change of the FWHM of the PSF from the middle of the scene to its right edge, and the change of e1 on that way and of e2
+    /// from the middle to the upper edge.
+    #[serde(default, skip_serializing_if = "is_constant")]
+    pub psf_gradient: [f64; 2],
     pub layout: Layout,
     /// Galaxies per arcmin².
     pub density: f64,
@@ -116,6 +123,10 @@ fn is_zero(number: &usize) -> bool {
     *number == 0
 }
 
+fn is_constant(gradient: &[f64; 2]) -> bool {
+    *gradient == [0.0; 2]
+}
+
 impl Default for SceneSettings {
     fn default() -> Self {
         SceneSettings {
@@ -125,6 +136,7 @@ impl Default for SceneSettings {
             pixel_arcsec: 0.2,
             seeing_arcsec: 0.7,
             psf_shape: [0.03, -0.02],
+            psf_gradient: [0.0; 2],
             layout: Layout::Random,
             density: 75.0,
             snr: [3.0, 400.0],
@@ -166,6 +178,7 @@ impl SceneSettings {
             pixel_arcsec,
             seeing_arcsec,
             psf_shape,
+            psf_gradient: [of_size, of_shape],
             layout: _,
             density,
             snr: [faint, bright],
@@ -198,14 +211,18 @@ impl SceneSettings {
         let (least, most) = FWHM_PX;
         let fwhm = seeing_arcsec / pixel_arcsec;
         expect(
-            (least..=most).contains(&fwhm),
-            format!("the seeing of {seeing_arcsec} arcsec is {fwhm:.2} pixels"),
-            format!("{least} to {most}"),
+            [-of_size, of_size]
+                .iter()
+                .all(|own| (least..=most).contains(&(fwhm * (1.0 + own)))),
+            format!(
+                "the seeing of {seeing_arcsec} arcsec is {fwhm:.2} pixels, with a change of {of_size}"
+            ),
+            format!("{least} to {most} everywhere"),
         )?;
-        let [e1, e2] = psf_shape;
+        let [e1, e2] = psf_shape.map(|e| e.abs() + of_shape.abs());
         expect(
             e1.hypot(e2) <= 0.3,
-            format!("the PSF's ellipticity is {e1}, {e2}"),
+            format!("the PSF's ellipticity is up to {e1}, {e2}"),
             "a modulus of at most 0.3".into(),
         )?;
         for (what, density) in [("galaxies", density), ("stars", star_density)] {
@@ -353,9 +370,7 @@ impl SceneSimulator {
             });
             sample.map_err(|error| SettingsError::new(format!("fit {}: {error}", k + 1)))?;
         }
-        let [e1, e2] = settings.psf_shape;
-        let fwhm = settings.seeing_arcsec / settings.pixel_arcsec;
-        let psf = FunctionalPsf::new(PSF, fwhm, Shear::new(e1, e2));
+        let psf = psf_at(&settings, [0.0; 2]);
         let psf = psf.map_err(|error| SettingsError::new(error.to_string()))?;
         // Of a lattice with one place in √3/2 times the square of the distance.
         let px2_per_galaxy = (60.0 / settings.pixel_arcsec).powi(2) / settings.density;
@@ -413,14 +428,35 @@ impl SceneSimulator {
         }
     }
 
-    /// The PSF as a star without noise, of sum one.
+    /// The PSF at the middle as a star without noise, of sum one.
     pub fn star(&self) -> Array2<f32> {
         self.psf.stamp(STAR).mapv(|value| value as f32)
     }
 
-    fn transformed(&self) -> TransformedPsf<'_> {
+    /// The PSF as a polynomial of degree two of the place from the middle, in units of the side: its terms 1, u, u², v, uv and v², on stamps
+    /// with a pixel at the middle.
+    pub fn star_terms(&self) -> Vec<f64> {
+        let star = |u: f64, v: f64| self.at_place([2.0 * u, 2.0 * v]).stamp(STAR + 1);
+        let (middle, edge) = (star(0.0, 0.0), 0.5);
+        let [right, left] = [star(edge, 0.0), star(-edge, 0.0)];
+        let [up, down] = [star(0.0, edge), star(0.0, -edge)];
+        let corners = [(edge, edge), (-edge, -edge), (edge, -edge), (-edge, edge)];
+        let [a, b, c, d] = corners.map(|(u, v)| star(u, v));
+        let square = |one: &Array2<f64>, other: &Array2<f64>| 2.0 * (one + other - 2.0 * &middle);
+        let (of_u2, of_v2) = (square(&right, &left), square(&up, &down));
+        let terms = [middle, right - left, of_u2, up - down, a + b - c - d, of_v2];
+        terms.iter().flatten().copied().collect()
+    }
+
+    // At a place from the middle in units of half the side. Beyond the edges it is as at them.
+    fn at_place(&self, place: [f64; 2]) -> FunctionalPsf {
+        let inside = place.map(|at| at.clamp(-1.0, 1.0));
+        psf_at(&self.settings, inside).expect("settings were checked")
+    }
+
+    fn transformed(&self, psf: &FunctionalPsf) -> TransformedPsf<'_> {
         self.transform
-            .of(&self.psf)
+            .of(psf)
             .expect("the transform is that of the PSF's profile")
     }
 
@@ -473,7 +509,7 @@ impl SceneSimulator {
     fn star_source(&self, index: usize, centre: [f64; 2], rng: &mut ChaCha8Rng) -> Source {
         let snr = random_snr(rng, STAR_SNR.into(), STAR_POWER);
         let point = |flux| Galaxy::point(flux).expect("fluxes drawn here are positive");
-        let flux = snr * NOISE_SIGMA / power(&point(1.0), &self.transformed()).sqrt();
+        let flux = snr * NOISE_SIGMA / power(&point(1.0), &self.transformed(&self.psf)).sqrt();
         Source {
             index,
             is_star: true,
@@ -522,7 +558,7 @@ impl SceneSimulator {
         };
         // S/N is defined before lensing, so that a cut by it does not select by shear.
         let unlensed = galaxy(1.0, Shear::ZERO);
-        let scale = snr * NOISE_SIGMA / power(&unlensed, &self.transformed()).sqrt();
+        let scale = snr * NOISE_SIGMA / power(&unlensed, &self.transformed(&self.psf)).sqrt();
         let light = galaxy(scale, g);
         let bulge = fit.bulge.map_or(0.0, |bulge| bulge.flux);
         let bulge_radius = fit.bulge.map_or(0.0, |bulge| bulge.half_light_arcsec);
@@ -544,7 +580,9 @@ impl SceneSimulator {
 
     /// Draws a source. Its light beyond the stamp is below 10⁻⁴ of its peak.
     pub fn draw(&self, source: &Source, scratch: &mut RenderScratch) -> Stamp {
-        let psf = self.transformed();
+        let half = 0.5 * self.settings.side as f64;
+        let psf = self.at_place(source.centre.map(|at| (at + 0.5) / half - 1.0));
+        let psf = self.transformed(&psf);
         let largest = STAMPS.len() - 1;
         let at = stamp_side(&source.light, &psf, &STAMPS).unwrap_or(largest);
         let side = STAMPS[at];
@@ -576,6 +614,14 @@ impl SceneSimulator {
             }
         }
     }
+}
+
+// At a place from the middle of the scene, in units of half the side.
+fn psf_at(settings: &SceneSettings, [u, v]: [f64; 2]) -> Result<FunctionalPsf, ProfileError> {
+    let [of_size, of_shape] = settings.psf_gradient;
+    let fwhm = settings.seeing_arcsec / settings.pixel_arcsec * (1.0 + of_size * u);
+    let [e1, e2] = settings.psf_shape;
+    FunctionalPsf::new(PSF, fwhm, Shear::new(e1 + of_shape * u, e2 + of_shape * v))
 }
 
 // An S/N between two bounds with N(> S/N) ∝ (S/N)^−power.

@@ -286,6 +286,8 @@ enum Values {
     Real(Vec<f64>),
     Whole(Vec<i64>),
     Text(Vec<String>, usize),
+    /// Of one row.
+    Vector(Vec<f64>),
 }
 
 impl Values {
@@ -313,6 +315,10 @@ impl Values {
             Values::Real(_) => (size_of::<f64>(), "1D".into(), "8-byte DOUBLE"),
             Values::Whole(_) => (size_of::<i64>(), "1K".into(), "8-byte INTEGER"),
             Values::Text(_, longest) => (*longest, format!("{longest}A"), "ASCII Character"),
+            Values::Vector(all) => {
+                let (bytes, count) = (size_of_val(all.as_slice()), all.len());
+                (bytes, format!("{count}D"), "8-byte DOUBLE")
+            }
         }
     }
 
@@ -326,6 +332,7 @@ impl Values {
                 bytes.extend(words[row].as_bytes());
                 bytes.resize(end, b' ');
             }
+            Values::Vector(all) => bytes.extend(all.iter().flat_map(|value| value.to_be_bytes())),
         }
     }
 }
@@ -352,13 +359,33 @@ fn table_bytes(table: &DataFrame, keys: &[(&str, Value)]) -> Result<Vec<u8>, Str
         .iter()
         .map(|column| (column.name().as_str(), Values::of(column)))
         .collect();
+    bytes_of_columns(&columns, table.height(), keys)
+}
+
+/// Writes a table of one row with one column, a vector, as [`read_vector`](super::read_vector) reads it.
+pub fn write_vector(
+    path: &Path,
+    column: &str,
+    vector: Vec<f64>,
+    keys: &[(&str, Value)],
+) -> Result<(), FileError> {
+    let columns = [(column, Values::Vector(vector))];
+    let bytes = bytes_of_columns(&columns, 1, keys).map_err(cannot(path))?;
+    atomic::write(path, &bytes)
+}
+
+fn bytes_of_columns(
+    columns: &[(&str, Values)],
+    rows: usize,
+    keys: &[(&str, Value)],
+) -> Result<Vec<u8>, String> {
     let width: usize = columns.iter().map(|(_, values)| values.format().0).sum();
     let mut bytes = Header::primary(8, &[]).blocks();
-    bytes.extend(table_header(&columns, width, table.height(), keys)?);
+    bytes.extend(table_header(columns, width, rows, keys)?);
     let start = bytes.len();
-    bytes.reserve(width * table.height() + BLOCK);
-    for row in 0..table.height() {
-        for (_, values) in &columns {
+    bytes.reserve(width * rows + BLOCK);
+    for row in 0..rows {
+        for (_, values) in columns {
             values.append(row, &mut bytes);
         }
     }
@@ -413,6 +440,19 @@ mod tests {
     use super::super::{read_table, read_table_keys};
     use super::*;
     use crate::frames::polars::{NamedFrom, Series};
+
+    #[test]
+    fn a_vector_is_read_back_with_its_keys() {
+        let path = std::env::temp_dir().join(format!("shearq-vector-{}.fits", std::process::id()));
+        let keys = [("DEGREE", Value::Int(2))];
+        write_vector(&path, "MASK", vec![1.5, -2.0, 3e5], &keys).unwrap();
+        let (found, cards) = super::super::read_vector(&path, 1, "MASK").unwrap();
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(
+            (found, cards["DEGREE"].as_str()),
+            (vec![1.5, -2.0, 3e5], "2")
+        );
+    }
 
     #[test]
     fn a_table_of_all_kinds_of_columns_is_read_back() {

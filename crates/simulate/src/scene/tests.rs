@@ -51,7 +51,7 @@ fn stamps_have_all_of_the_light_of_their_sources() {
         simulator.draw(&source, &mut scratch).add_to(&mut image);
         whole.render(
             &source.light,
-            &simulator.transformed(),
+            &simulator.transformed(&simulator.psf),
             (x, y),
             &mut scratch,
             &mut pixels,
@@ -284,4 +284,48 @@ fn settings_out_of_range_are_refused() {
         &|own| own.constant_shear = Some([0.2, 0.0]),
         "constant shear",
     );
+}
+
+#[test]
+fn a_psf_that_varies_has_the_terms_of_its_model() {
+    let simulator = simulator(|settings| settings.psf_gradient = [0.05, 0.03]);
+    let terms = simulator.star_terms();
+    let side = STAR + 1;
+    // From the middle, in units of the side.
+    let [u, v] = [0.4, -0.3];
+    let factors = [1.0, u, u * u, v, u * v, v * v];
+    let own = simulator.at_place([0.8, -0.6]).stamp(side);
+    let middle = simulator.at_place([0.0, 0.0]).stamp(side);
+    let (mut error, mut change) = (0.0f64, 0.0f64);
+    for (at, ((y, x), value)) in own.indexed_iter().enumerate() {
+        let model = (0..6).map(|k| factors[k] * terms[k * side * side + at]);
+        error = error.max((model.sum::<f64>() - value).abs());
+        change = change.max((middle[[y, x]] - value).abs());
+    }
+    // Terms of third order are missing.
+    assert!(error < 2e-3 * change, "{error} {change}");
+}
+
+#[test]
+fn objects_are_behind_the_psf_of_their_place() {
+    let varying = simulator(|settings| {
+        settings.psf_gradient = [0.2, 0.0];
+        settings.star_density = 3.0;
+    });
+    let constant = simulator(|settings| settings.star_density = 3.0);
+    let mut scratch = RenderScratch::new();
+    let mut compared = 0;
+    for source in sources(&varying, 1).iter().filter(|source| source.is_star) {
+        let mut peak = |simulator: &SceneSimulator| {
+            let stamp = simulator.draw(source, &mut scratch);
+            largest(stamp.pixels.into_iter())
+        };
+        let (own, other) = (peak(&varying), peak(&constant));
+        // Broader to the right of the middle, with the same light.
+        if (source.centre[0] - 99.5).abs() > 10.0 {
+            assert_eq!(own < other, source.centre[0] > 99.5, "{source:?}");
+            compared += 1;
+        }
+    }
+    assert!(compared > 1, "{compared}");
 }
