@@ -47,6 +47,26 @@ def test_nothing_is_detected_near_missing_pixels() -> None:
     assert abs(x - 181) < 1
 
 
+def test_a_psf_that_varies_is_drawn_at_its_places() -> None:
+    pixels = image([(100, 70), (180, 150)])
+    places = []
+
+    def psf(x: float, y: float) -> NDArray[np.float64]:
+        places.append((x, y))
+        return STAR
+
+    found = shearq.detect(pixels, psf, noise=1.0)
+    # One PSF, by another way: that of four parts along each axis, and of the only cell.
+    assert np.allclose(found["e1"], shearq.detect(pixels, STAR, noise=1.0)["e1"])
+    assert {(33.0, 33.0), (130.5, 130.5)} < set(places)
+
+    def negative(x: float, y: float) -> NDArray[np.float64]:
+        return STAR if x < 200 else -STAR
+
+    with pytest.raises(ValueError, match="psf: .* at x = 228.0, y = 33.0 sum to -"):
+        shearq.detect(pixels, negative, noise=1.0)
+
+
 def test_a_wcs_turns_shapes_to_the_sky() -> None:
     pixels = image([(100, 70)])
     plain = shearq.detect(pixels, STAR, noise=1.0)

@@ -113,6 +113,18 @@ def test_a_model_that_piff_fitted_is_drawn_at_the_galaxies(command, tmp_path):
     assert abs(shear.g1 / exactly.g1 - 1) < 1e-3 + 1e-4 / abs(exactly.g1)
 
 
+def test_a_model_on_other_pixels_is_refused(command, tmp_path, capfd):
+    fitted(tmp_path)
+    header = fits.getheader("image0.fits")
+    for key in ("CD1_1", "CD2_2"):
+        header[key] *= 1.5
+    fits.writeto("coarse.fits", fits.getdata("image0.fits"), header)
+    assert command("detect --exposure image0.fits --psf model.piff --noise 1 --threshold 5 --out detected") == 0
+    capfd.readouterr()
+    assert command("detect --exposure coarse.fits --psf model.piff --noise 1 --out other") != 0
+    assert f"the model has pixels of {SCALE:.4g} arcsec, and the image of the galaxies of {1.5 * SCALE:.4g} arcsec; expected the same" in capfd.readouterr().err
+
+
 def test_chips_have_their_galaxies_psf_and_wcs(command, tmp_path, capfd):
     psf = fitted(tmp_path, chips=2)
     images = [galsim.fits.read(f"image{chip}.fits") for chip in range(2)]

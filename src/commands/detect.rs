@@ -21,14 +21,14 @@ use crate::{count, tell};
 /// its detection. Pixels with a weight that touch each other are a row of the catalogue: its place (x, y; ra, dec), the sums of
 /// weighted ellipticities (e1, e2), their response, the weight (selection) and the S/N. `mean`, `shear` and `bias` use it as it is.
 ///
-/// Noise and PSF have to be the same everywhere on the exposure. Near an edge or a missing pixel (21 px at a seeing of
+/// The noise has to be the same everywhere on the exposure, and the PSF, too, unless --psf is a model of it. Near an edge or a missing pixel (21 px at a seeing of
 /// 0.7″ and pixels of 0.2″), nothing is detected.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Exposure: the first image of its file, or the one of `FILE[SCI,2]`.
     #[arg(long, value_name = "FILE")]
     exposure: PathBuf,
-    /// Stamp of a star, or of the PSF, centred on the star.
+    /// Stamp of a star, or of the PSF, centred on the star; or a model of PSFEx or Piff, if the PSF varies over the exposure.
     #[arg(long, value_name = "FILE")]
     psf: PathBuf,
     /// Mask of the exposure: a pixel is missing if it is not zero.
@@ -113,6 +113,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         detections,
         weight,
         margin,
+        cells,
         noise,
         is_measured,
         frame,
@@ -134,6 +135,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     ));
     let source = if is_measured { "measured" } else { "given" };
     tell(format_args!("noise: σ = {noise:.4}, {source}"));
+    if cells > 1 {
+        tell(format_args!(
+            "PSF: that of the model at the middle of each of {cells} parts of the exposure"
+        ));
+    }
     if frame == Frame::Sky {
         tell(format_args!(
             "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west)"
@@ -145,6 +151,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "detections": detections,
             "weight": weight,
             "margin": margin,
+            "cells": cells,
             "noise": noise,
             "noise_is_measured": is_measured,
             "frame": frame.to_string(),

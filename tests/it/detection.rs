@@ -63,6 +63,50 @@ fn catalogues_are_the_same_for_any_number_of_threads() {
 }
 
 #[test]
+fn a_psf_that_varies_is_that_of_each_place() {
+    let folder = Folder::new();
+    let scene = "simulate --scenes 1 --side 900 --border 60 --seed 3 --density 40 --snr 20,200 --constant-shear 0,0 --psf-shape 0,0";
+    folder.run(&format!("{scene} --out constant"));
+    folder.run(&format!("{scene} --psf-gradient 0.05,0.1 --out varying"));
+    let detect = |out: &str, more: &str| folder.json(&format!("detect {more} --out {out}"));
+    let scene =
+        |data: &str, psf: &str| format!("--exposure {data}/scene-001.fits --psf {data}/{psf}");
+    let constant = detect("constant/out", &scene("constant", "psf.fits"));
+    let varying = detect("varying/out", &scene("varying", "model.psf --threads 1"));
+    assert_eq!(
+        (constant["cells"].as_u64(), varying["cells"].as_u64()),
+        (Some(1), Some(9))
+    );
+    detect("varying/three", &scene("varying", "model.psf --threads 3"));
+    assert!(contents(&folder.at("varying/out")) == contents(&folder.at("varying/three")));
+    detect("varying/middle", &scene("varying", "psf.fits"));
+    // e1 of the PSF is 0.1 at the right edge, and −0.1 at the left one.
+    let difference = |out: &str| {
+        let g1 = |side: &str| {
+            let mean = folder.json(&format!(
+                "bias varying/{out}/set01/catalogue-001.parquet --g1 0 --g2 0 --where \"x {side} 450\""
+            ));
+            mean["rows"][0]["c1"].as_f64().unwrap()
+        };
+        g1(">") - g1("<")
+    };
+    let [own, middle] = ["out", "middle"].map(difference);
+    // Shapes of galaxies cancel in the difference of both.
+    assert!(middle - own > 0.05, "{own} {middle}");
+}
+
+#[test]
+fn models_of_other_exposures_are_refused() {
+    let folder = Folder::new();
+    folder.run("simulate --scenes 1 --side 300 --density 20 --constant-shear 0,0 --psf-gradient 0.01,0.01 --out small");
+    folder.run("simulate --scenes 1 --side 900 --density 20 --constant-shear 0,0 --out large");
+    folder.refuses(
+        "detect --exposure large/scene-001.fits --psf small/model.psf --out out",
+        "the model has no stars near x = 788, y = 113 of the exposure (found stars with x from 0 to 300 and y from 0 to 300; expected some in all parts). Try: the model of this exposure and chip",
+    );
+}
+
+#[test]
 fn what_an_exposure_lacks_is_said() {
     let folder = Folder::new();
     folder.run("simulate --scenes 1 --side 400 --density 0 --constant-shear 0,0 --out empty");

@@ -1,7 +1,7 @@
 //! The weights and ellipticities of all pixels of an exposure.
 
 use multiversion::multiversion;
-use ndarray::ArrayView2;
+use ndarray::{Array2, ArrayView2};
 use shearq_measure::parts::{ExposureDefects, gaussian_sigma};
 use shearq_measure::{MeasureError, StampNoise};
 use shearq_quantities::fourier::Complex64;
@@ -22,12 +22,23 @@ const MAX_STAR: usize = 512;
 // Of a bound, in its standard deviations: what the Fourier transform and the sums over squares may differ by.
 const SLACK: f64 = 0.01;
 
+/// What detectors of an exposure have in common, whatever the star.
+#[derive(Debug, Clone)]
+struct Shared {
+    settings: DetectionMethod,
+    noise: StampNoise,
+    lengths: Lengths,
+    pixels: PixelShape,
+    turn: Spin2,
+    defects: ExposureDefects,
+}
+
 /// Finds the detections of exposures behind a star.
 #[derive(Debug)]
 pub struct Detector {
+    shared: Shared,
     functionals: Functionals,
     radius: usize,
-    lengths: Lengths,
     steps: Steps,
     /// Standard deviation of the noise of v₀.
     light_noise: f64,
@@ -38,8 +49,6 @@ pub struct Detector {
     transform: SquareTransform,
     /// That of v₀, and those of the neighbours if they are between pixels.
     light_filters: Vec<Vec<Complex64>>,
-    turn: Spin2,
-    defects: ExposureDefects,
 }
 
 /// Buffers of a thread.
@@ -78,19 +87,7 @@ impl Detector {
         if !(noise.sigma() > 0.0 && noise.sigma().is_normal()) {
             return Err(MeasureError::Noise(noise.sigma().to_string()));
         }
-        if !star.is_square() || star.nrows() > MAX_STAR {
-            return Err(MeasureError::Shape {
-                what: "the PSF",
-                found: format!("{} × {} pixels", star.ncols(), star.nrows()),
-                expected: format!(
-                    "a square stamp of a star, at most {MAX_STAR} pixels a side. Try: exchange exposure and PSF, or cut the star"
-                ),
-            });
-        }
-        let sum = star.sum();
-        if !(sum > 0.0 && sum.is_finite()) {
-            return Err(MeasureError::DarkPsf(sum));
-        }
+        let star = of_sum_one(star)?;
         let (turn, pixels) = match jacobian {
             Some(jacobian) => {
                 let (orientation, pixels) = jacobian.factors();
@@ -101,13 +98,42 @@ impl Detector {
                 PixelShape::SQUARE,
             ),
         };
-        let star = star.mapv(|value| value / sum);
         let sigma = gaussian_sigma(star.view());
         let lengths = Lengths {
             detection_sigma: settings.detection_sigma * sigma,
             moment_sigma: settings.moment_sigma * sigma,
             distance: (settings.neighbour_distance * sigma).round().max(1.0) as usize,
         };
+        let shared = Shared {
+            settings: *settings,
+            noise: noise.clone(),
+            lengths,
+            pixels,
+            turn,
+            defects: ExposureDefects::new(star.view(), noise.sigma()),
+        };
+        Ok(Detector::with(&star, shared))
+    }
+
+    /// The same behind another star, of sum one. Smoothed light and moments have the same widths, and margin and tiles are the same, so
+    /// that neither changes where the star does.
+    pub(crate) fn behind(&self, star: &Array2<f64>) -> Self {
+        Detector::with(star, self.shared.clone())
+    }
+
+    /// Also takes pixels for light that are as sharp as a star of sum one.
+    pub(crate) fn keep_light_behind(&mut self, star: ArrayView2<'_, f64>) {
+        self.shared.defects.keep_light_behind(star);
+    }
+
+    fn with(star: &Array2<f64>, shared: Shared) -> Self {
+        let Shared {
+            settings,
+            ref noise,
+            lengths,
+            pixels,
+            ..
+        } = shared;
         let reach = (KERNEL_SIGMAS * lengths.detection_sigma + lengths.distance as f64)
             .max(KERNEL_SIGMAS * lengths.moment_sigma);
         // Circles on the sky are longer along one axis of the pixels.
@@ -135,19 +161,17 @@ impl Detector {
             neighbour_share: settings.neighbour_share,
             softening: settings.softening * deviation(M00),
         };
-        Ok(Detector {
+        Detector {
             light_filters: light_filters(star.view(), &lengths, pixels, &transform),
             light_noise: deviation(LIGHT),
             functionals,
             radius,
-            lengths,
             steps,
             of_shear,
             of_psf,
             transform,
-            turn,
-            defects: ExposureDefects::new(star.view(), noise.sigma()),
-        })
+            shared,
+        }
     }
 
     /// Buffers for [`Detector::detect`].
@@ -158,7 +182,7 @@ impl Detector {
             spectrum: vec![Complex64::default(); pixels],
             maps: vec![vec![Complex64::default(); pixels]; self.light_filters.len()],
             transform: vec![Complex64::default(); self.transform.scratch()],
-            defects: self.defects.clone(),
+            defects: self.shared.defects.clone(),
             places: Vec::new(),
         }
     }
@@ -202,7 +226,12 @@ impl Detector {
 
     // Those on each side of it.
     fn outer(&self) -> usize {
-        self.radius + 1 + self.lengths.distance
+        self.radius + 1 + self.shared.lengths.distance
+    }
+
+    /// Columns of the exposure that the middle of a tile has.
+    pub(crate) fn columns_per_tile(&self) -> usize {
+        self.inner()
     }
 
     /// Rows of the exposure that the middles of a row of tiles have.
@@ -271,7 +300,7 @@ impl Detector {
             self.transform.inverse(image, map, transform);
         }
         let slack = SLACK * self.light_noise;
-        let distance = self.lengths.distance;
+        let distance = self.shared.lengths.distance;
         for y in outer..outer + 2 * inner {
             // The row in the map of its block.
             let is_lower = y >= outer + inner;
@@ -329,11 +358,29 @@ impl Detector {
         Some(DetectedPixel {
             place,
             weight,
-            e: self.turn.turn(e),
-            response: self.turn.turn_response(response),
+            e: self.shared.turn.turn(e),
+            response: self.shared.turn.turn_response(response),
             snr: u[LIGHT] / self.light_noise,
         })
     }
+}
+
+/// A star in units of its light.
+pub(crate) fn of_sum_one(star: ArrayView2<'_, f64>) -> Result<Array2<f64>, MeasureError> {
+    if !star.is_square() || star.nrows() > MAX_STAR {
+        return Err(MeasureError::Shape {
+            what: "the PSF",
+            found: format!("{} × {} pixels", star.ncols(), star.nrows()),
+            expected: format!(
+                "a square stamp of a star, at most {MAX_STAR} pixels a side. Try: exchange exposure and PSF, or cut the star"
+            ),
+        });
+    }
+    let sum = star.sum();
+    if !(sum > 0.0 && sum.is_finite()) {
+        return Err(MeasureError::DarkPsf(sum));
+    }
+    Ok(star.mapv(|value| value / sum))
 }
 
 /// Σ over a square of `side` pixels, of rows that are `columns` apart, of each pixel times its weights.

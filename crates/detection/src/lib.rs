@@ -16,10 +16,11 @@
 //!
 //! A [`Detector`] works on tiles of two blocks, one below the other, whose middles cover the exposure. v₀ of both blocks, by one
 //! Fourier transform, decides which pixels may have a weight. Their functionals are sums over a square of pixels, which do not
-//! depend on tiles.
+//! depend on tiles. [`Cells`] have a detector each, of exposures whose PSF varies.
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
+mod cells;
 mod detector;
 mod functionals;
 mod groups;
@@ -29,6 +30,7 @@ mod pixel;
 mod testing;
 mod weight;
 
+pub use cells::Cells;
 pub use detector::{DetectionScratch, Detector, Tile};
 pub use groups::Detections;
 pub use pixel::{DetectedPixel, Detection};

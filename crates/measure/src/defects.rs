@@ -84,6 +84,11 @@ impl ExposureDefects {
         }
     }
 
+    /// Keeps light behind another PSF of sum one, too.
+    pub fn keep_light_behind(&mut self, psf: ArrayView2<'_, f64>) {
+        self.limits = self.limits.wider(&LightLimits::from_psf(psf));
+    }
+
     /// Makes the pixels of a square part of an exposure, of `n` pixels a side, NaN that hold no light: areas of one value, and pixels that are
     /// too dark or too bright for those around them. Appends their places to `found`.
     pub fn remove(&mut self, part: &mut [f32], n: usize, found: &mut Vec<usize>) {

@@ -47,6 +47,13 @@ pub enum MeasureError {
     /// No light to normalise a PSF by.
     #[error("the pixels of the PSF stamp sum to {sum}; expected a positive sum{}", tried(self.hint()), sum = .0)]
     DarkPsf(f64),
+    /// The same of a PSF that varies.
+    #[error("the pixels of the PSF at x = {:.1}, y = {:.1} sum to {sum}; expected a positive sum{}", at[0], at[1], tried(self.hint()))]
+    DarkPsfAt {
+        sum: f64,
+        /// In FITS pixels.
+        at: [f64; 2],
+    },
     /// A star so near an edge of its stamp that it cannot be cut around itself.
     #[error("the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star{}", tried(self.hint()))]
     OffCentre {
@@ -134,6 +141,7 @@ impl MeasureError {
         Self::NoBorders { .. } => "stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels (cut off, or left out by a settings file with a smaller stamp.size); for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
         Self::OffCentre { .. } => "a larger PSF stamp, or one that is centred on the star to within 1 px",
         Self::DarkPsf(sum) if *sum < 0.0 => INVERTED_PSF,
+        Self::DarkPsfAt { .. } => "a model of the PSF whose stars are in all parts of the exposure",
         Self::NoStamps => "shearq detect",
         Self::ShearedPixels { most, .. } if *most < 0.1 => "a linear configuration, such as 48/linear/star",
         Self::ShearedPixels { .. } => "resampled images",

@@ -15,12 +15,14 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, frame_entry};
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Progress;
-use shearq_detection::{DetectedPixel, Detection, Detections, Detector, Tile};
+use shearq_detection::{Cells, DetectedPixel, Detection, Detections, Detector, Tile};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, Place};
-use shearq_measure::{Examination, MeasureError, NoisePlan, PixelFrame, StampNoise};
+use shearq_measure::{
+    EXAMINED_PSFS, Examination, MeasureError, NoisePlan, PixelFrame, StampNoise, Threads as _,
+};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 use shearq_submissions::{
@@ -29,7 +31,9 @@ use shearq_submissions::{
 
 use crate::PipelineError;
 use crate::engine;
-use crate::gather::{Exposure, Files, Masks, PlaneReader, another, lose};
+use crate::gather::{
+    Chip, Exposure, Files, Masks, PlaneReader, PsfModel, another, lose, truncation,
+};
 use crate::measure::metadata;
 use crate::wcs::{Wcs, aligned};
 
@@ -37,7 +41,7 @@ use crate::wcs::{Wcs, aligned};
 #[derive(Debug, Clone)]
 pub struct DetectionTask<'a> {
     pub exposure: Files<'a>,
-    /// A stamp of the star, at its centre.
+    /// A stamp of the star, at its centre, or a model of the PSF by position.
     pub psf: Files<'a>,
     pub masks: Option<Masks<'a>>,
     /// Standard deviation of a pixel; that of the header key NOISESIG, or measured with its correlation, if `None`.
@@ -71,6 +75,8 @@ pub struct Detected {
     pub weight: f64,
     /// Pixels from an edge or a missing pixel within which there is no detection.
     pub margin: usize,
+    /// Parts of the exposure, each with the PSF at its middle; 1 if it does not vary.
+    pub cells: usize,
     /// Standard deviation of a pixel, and whether it was measured.
     pub noise: f64,
     pub is_measured: bool,
@@ -96,15 +102,17 @@ const MAX_NOISE_DIFFERENCE: f64 = 0.05;
 // Most pixels that tell the sky of an exposure; those of the grid below are fewer.
 const SAMPLE: usize = 4_000_000;
 
-/// What is doubtful about a PSF, the sky of an exposure, and its noise if it was `measured`, too.
+/// What is doubtful about the PSFs of cells, the sky of an exposure, and its noise if it was `measured`, too.
 pub fn doubts(
-    star: ArrayView2<'_, f64>,
+    stars: &[Array2<f64>],
     sky: Option<SkyLevel>,
     noise: f64,
     measured: Option<f64>,
 ) -> Vec<String> {
-    let mut psf = Examination::new(star.nrows(), 0);
-    psf.add_psf((&star / star.sum()).view(), None);
+    let mut psf = Examination::new(stars[0].nrows(), 0);
+    for star in stars.iter().step_by(stars.len().div_ceil(EXAMINED_PSFS)) {
+        psf.add_psf((star / star.sum()).view(), None);
+    }
     let mut doubts: Vec<String> = psf.warnings().iter().map(ToString::to_string).collect();
     doubts.extend(sky.and_then(|sky| sky.doubts(noise)));
     let is_unlike = |own: &f64| (own / noise - 1.0).abs() > MAX_NOISE_DIFFERENCE;
@@ -178,12 +186,13 @@ pub fn unlit_in_words(count: usize) -> Option<String> {
 /// returns a function that reads a number of rows. Progress is in pixels.
 pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
     threads: usize,
-    detector: &Detector,
+    cells: &Cells,
     [width, height]: [usize; 2],
     open: impl FnOnce() -> Result<R, PipelineError> + Send,
     progress: &mut dyn Progress,
 ) -> Result<(Vec<Detection>, usize), PipelineError> {
-    let least = 2 * detector.margin() + 1;
+    let shared = cells.shared();
+    let least = 2 * shared.margin() + 1;
     if width.min(height) < least {
         return Err(MeasureError::Shape {
             what: "the exposure",
@@ -201,11 +210,18 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
         threads,
         |feeder| {
             let mut bands = Bands::new(width, height, open()?);
-            for number in 0..height.div_ceil(detector.rows_per_tile()) {
-                let tiles: Vec<Tile> = detector.tiles(width, number).collect();
+            let mut detectors: Vec<Arc<Detector>> = Vec::new();
+            for number in 0..height.div_ceil(shared.rows_per_tile()) {
+                if let Some(row) = cells.beginning(number) {
+                    detectors = feeder
+                        .ahead()
+                        .map(row.collect(), |cell| cells.detector(cell));
+                }
+                let tiles: Vec<Tile> = shared.tiles(width, number).collect();
                 let band = Arc::new(bands.of(&tiles[0])?);
                 for (at, tile) in tiles.iter().enumerate() {
-                    let job = (Arc::clone(&band), *tile, at + 1 == tiles.len());
+                    let detector = Arc::clone(&detectors[cells.column(at)]);
+                    let job = (Arc::clone(&band), detector, *tile, at + 1 == tiles.len());
                     if !feeder.push(job) {
                         return Ok(());
                     }
@@ -213,8 +229,8 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
             }
             Ok(())
         },
-        || (detector.scratch(), Vec::new()),
-        |(scratch, pixels), (band, tile, is_last)| {
+        || (shared.scratch(), Vec::new()),
+        |(scratch, pixels), (band, detector, tile, is_last)| {
             copy_tile(&band, width, &tile, pixels);
             let [columns, rows] = tile.sides;
             let unlit = detector.remove_unlit(pixels, scratch);
@@ -231,7 +247,7 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
                 for pixel in of_row.drain(..) {
                     found.add(&pixel);
                 }
-                let rows = detector.rows_per_tile().min(left);
+                let rows = shared.rows_per_tile().min(left);
                 left -= rows;
                 progress.advance((rows * width) as u64);
             }
@@ -344,15 +360,15 @@ impl DetectionTask<'_> {
         let jacobian = self.jacobian(&wcs, sides, &exposure)?;
         let sample = sample(&mut exposure, sides)?;
         let level = self.noise(&mut exposure, &sample)?;
-        let star = self.star(&wcs)?;
-        let detector = self.detector(&exposure, &star, &level.noise, jacobian.as_ref())?;
+        let axes = (&wcs, jacobian.as_ref());
+        let (cells, of_model) = self.cells(&exposure, sides, &level.noise, axes)?;
         let path = run.catalogue(out, id.set, id.image);
         let print = of_image(&Place::of(&self.exposure.paths[0]).path)?;
         refuse_other(&path, run.format, &print)?;
         let missing = AtomicUsize::new(0);
         let mut progress = start((sides[0] * sides[1]) as u64);
         let open = || self.open(&missing);
-        let found = detect_rows(threads, &detector, sides, open, progress.as_mut());
+        let found = detect_rows(threads, &cells, sides, open, progress.as_mut());
         drop(progress);
         let (found, unlit) = found.map_err(|error| match error {
             PipelineError::Measure(error) => exposure.origin.fault(&error.to_string()).into(),
@@ -379,12 +395,14 @@ impl DetectionTask<'_> {
             let [x, y] = [stamp % per_row, stamp / per_row].map(|at| at as f64);
             ([x / per_row as f64, y / rows as f64], sample[at])
         });
-        let mut doubts = doubts(star.view(), sky, sigma, level.measured);
+        let mut doubts = doubts(cells.stars(), sky, sigma, level.measured);
+        doubts.extend(of_model);
         doubts.extend(unlit_in_words(unlit));
         Ok(Detected {
             detections: found.len(),
             weight: found.iter().map(|own| own.weight).sum(),
-            margin: detector.margin(),
+            margin: cells.shared().margin(),
+            cells: cells.stars().len(),
             noise: sigma,
             is_measured: level.source == MEASURED,
             frame,
@@ -422,18 +440,35 @@ impl DetectionTask<'_> {
         })
     }
 
-    fn detector(
+    // With what is doubtful about a model of the PSF.
+    fn cells(
         &self,
         exposure: &Exposure<'_>,
-        star: &Array2<f64>,
+        sides: [usize; 2],
         noise: &StampNoise,
-        jacobian: Option<&Jacobian>,
-    ) -> Result<Detector, FileError> {
-        let detector = Detector::new(star.view(), noise, jacobian, &self.settings);
-        detector.map_err(|error| match error {
-            MeasureError::Noise(_) => exposure.origin.fault(&error.to_string()),
-            _ => FileError::with_hint(&self.psf.paths[0], &error, error.hint()),
-        })
+        (wcs, jacobian): (&Wcs, Option<&Jacobian>),
+    ) -> Result<(Cells, Option<String>), PipelineError> {
+        let (path, settings) = (&self.psf.paths[0], &self.settings);
+        let mut doubt = None;
+        let cells = match PsfModel::read(path, Chip { at: 0, of: 1 })? {
+            None => Cells::constant(self.star(wcs)?, noise, jacobian, settings).map_err(Into::into),
+            Some(model) => Cells::varying(sides, noise, jacobian, settings, |places| {
+                let framed = model.framed(places);
+                let warning = framed.and_then(|(psf, fine)| truncation(&psf, fine));
+                doubt = warning.map(|warning| warning.to_string());
+                Ok::<_, PipelineError>(model.stars(path, places, wcs.scale())?)
+            }),
+        };
+        let cells = cells.map_err(|error| match error {
+            PipelineError::Measure(error @ MeasureError::Noise(_)) => {
+                exposure.origin.fault(&error.to_string()).into()
+            }
+            PipelineError::Measure(error) => {
+                FileError::with_hint(path, &error, error.hint()).into()
+            }
+            other => other,
+        })?;
+        Ok((cells, doubt))
     }
 
     // What the catalogue states of its exposure, of which `print` is the fingerprint.
@@ -538,7 +573,8 @@ impl DetectionTask<'_> {
             return Err(FileError::new(
                 path,
                 "there are several PSFs (expected one stamp for the exposure)",
-            ));
+            )
+            .hint("a model of PSFEx or Piff, if the PSF varies"));
         }
         if let Some(warning) = Wcs::disagreements(&planes.wcs()?, wcs).next() {
             return Err(FileError::new(path, warning));
@@ -729,12 +765,7 @@ mod tests {
         }
     }
 
-    #[test]
-    fn defects_are_found_and_stars_are_kept() {
-        const SIDE: usize = 400;
-        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::new(0.05, 0.0));
-        let star = psf.unwrap().stamp(48);
-        let star = &star / star.sum();
+    fn noise_image(sides: [usize; 2]) -> Array2<f32> {
         // Sums of twelve uniform numbers have a variance of one.
         let mut state = 1u64;
         let mut uniform = || {
@@ -743,9 +774,73 @@ mod tests {
                 .wrapping_add(1_442_695_040_888_963_407);
             (state >> 40) as f32 / (1u64 << 24) as f32
         };
-        let mut image = Array2::from_shape_simple_fn((SIDE, SIDE), || {
-            (0..12).map(|_| uniform()).sum::<f32>() - 6.0
+        Array2::from_shape_simple_fn(sides, || (0..12).map(|_| uniform()).sum::<f32>() - 6.0)
+    }
+
+    fn found_on(image: &Array2<f32>, cells: &Cells) -> (Vec<Detection>, usize) {
+        let open = || {
+            let mut rows = image.rows().into_iter();
+            Ok(move |count: usize| Ok(rows.by_ref().take(count).flatten().copied().collect()))
+        };
+        let (height, width) = image.dim();
+        let mut quiet = shearq_dataset::threads::Quiet;
+        detect_rows(2, cells, [width, height], open, &mut quiet).unwrap()
+    }
+
+    #[test]
+    fn doubts_about_psfs_are_stated_once_with_their_number() {
+        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::ZERO);
+        let star = psf.unwrap().stamp(48);
+        let with_sky = &star + 3e-4;
+        let found = doubts(&[star, with_sky.clone(), with_sky], None, 1.0, None);
+        let [doubt] = &found[..] else {
+            panic!("{found:?}")
+        };
+        assert!(doubt.contains("on 2 of 3 PSFs"), "{doubt}");
+    }
+
+    #[test]
+    fn a_galaxy_on_the_border_of_cells_is_one_detection() {
+        let sides = [900, 200];
+        let star = |(x, _): (f64, f64)| {
+            let psf = PsfProfile::Moffat { beta: 3.0 };
+            let psf = FunctionalPsf::new(psf, 3.3 + 4e-4 * x, Shear::new(1e-4 * x, 0.0));
+            psf.unwrap().stamp(48)
+        };
+        let settings = DetectionMethod::default();
+        let noise = StampNoise::white(1.0);
+        let cells = Cells::varying(sides, &noise, None, &settings, |places| {
+            Ok::<_, PipelineError>(places.iter().map(|place| star(*place)).collect())
         });
+        let cells = cells.unwrap();
+        let tiles = cells.shared().tiles(sides[0], 0);
+        let at = |column: usize, tile: Tile| (cells.column(column), tile.origin[0]);
+        let tiles: Vec<(usize, i64)> = tiles.enumerate().map(|(k, tile)| at(k, tile)).collect();
+        let first = tiles.iter().find(|(column, _)| *column == 1).unwrap();
+        let border = (first.1 - tiles[0].1) as usize;
+        let mut image = noise_image([sides[1], sides[0]]);
+        for ((y, x), value) in star((border as f64, 0.0)).indexed_iter() {
+            image[[76 + y, border - 24 + x]] += (3000.0 * value) as f32;
+        }
+        let (found, _) = found_on(&image, &cells);
+        let bright: Vec<&Detection> = found.iter().filter(|own| own.snr > 50.0).collect();
+        let [one] = bright[..] else {
+            panic!("{found:?}")
+        };
+        assert!(
+            (one.centre[0] - (border as f64 - 0.5)).abs() < 0.1,
+            "{one:?}"
+        );
+        assert!(one.pixels > 4, "{one:?}");
+    }
+
+    #[test]
+    fn defects_are_found_and_stars_are_kept() {
+        const SIDE: usize = 400;
+        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::new(0.05, 0.0));
+        let star = psf.unwrap().stamp(48);
+        let star = &star / star.sum();
+        let mut image = noise_image([SIDE, SIDE]);
         // Stars of S/N 20 to 10⁵.
         for number in 0..16 {
             let flux = 100.0 * 1.8f64.powi(number);
@@ -756,22 +851,8 @@ mod tests {
         }
         let settings = DetectionMethod::default();
         let noise = StampNoise::white(1.0);
-        let detector = Detector::new(star.view(), &noise, None, &settings).unwrap();
-        let unlit = |image: &Array2<f32>| {
-            let open = || {
-                let mut rows = image.rows().into_iter();
-                Ok(move |count: usize| Ok(rows.by_ref().take(count).flatten().copied().collect()))
-            };
-            detect_rows(
-                2,
-                &detector,
-                [SIDE, SIDE],
-                open,
-                &mut shearq_dataset::threads::Quiet,
-            )
-            .unwrap()
-            .1
-        };
+        let cells = Cells::constant(star.clone(), &noise, None, &settings).unwrap();
+        let unlit = |image: &Array2<f32>| found_on(image, &cells).1;
         assert_eq!(unlit(&image), 0);
         for (at, light) in [(100, 30.0), (210, 100.0), (305, 1e5), (140, -500.0)] {
             image[[at, at + 5]] = light;

@@ -2,20 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from . import _schema, _shearq
 from ._arrays import double, real, shaped, shown, with_missing, without_sentinels
 from ._catalogue import Catalogue
+from ._psf_models import PsfsOfModel, _doubts, _draw_of
 from ._threads import thread_count
 from ._warn import DataWarning, warn
 from ._wcs import WcsLike, jacobians
 
 
+# Pixels a side of PSFs that are drawn: beyond them, a Moffat profile of β = 2.5 with a FWHM of 4 px has 1 % of its light.
+_STAR = 64
+
+
+def _jacobians(wcs: WcsLike, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Those at places in FITS pixels, from which the WCS of astropy counts as numpy does."""
+    x, y = (places - (0.0 if hasattr(wcs, "jacobian") else 1.0)).T
+    return jacobians(wcs, len(places), x, y)
+
+
+def _stars(psf: Any, draw: Callable[..., Any], wcs: WcsLike | None) -> Callable[[list[tuple[float, float]]], NDArray[np.float64]]:
+    """A function that draws the PSFs of a model at places in FITS pixels."""
+
+    def stars(places: list[tuple[float, float]]) -> NDArray[np.float64]:
+        at = np.array(places)
+        _doubts(psf, at, wcs, {}, ("parts of the image", "part"))
+        return np.ascontiguousarray(PsfsOfModel(draw, _STAR, at, None if wcs is None else _jacobians(wcs, at), {}))
+
+    return stars
+
+
 def detect(
     image: ArrayLike,
-    psf: ArrayLike,
+    psf: Any,
     *,
     noise: float,
     mask: ArrayLike | None = None,
@@ -33,8 +58,10 @@ def detect(
     ----------
     image : array of shape (ny, nx)
         The exposure, without sky. Pixels that are masked, not finite or −1e30 are missing: nothing is detected near them.
-    psf : array of shape (py, px)
-        The PSF of the exposure as a stamp that is centred on the star.
+    psf : array of shape (py, px), model, or function of (x, y)
+        The PSF of the exposure as a stamp that is centred on the star. If it varies: a model of Piff, PSFEx or Rubin, or a function
+        that returns an image or a profile of GalSim at a place in FITS pixels, as for :func:`measure`. It is drawn at the middle of
+        each part of about 400 pixels a side, in which it is taken as constant.
     noise : float
         Standard deviation of the noise of a pixel, which has to be white and of one level.
     mask : array of shape (ny, nx), optional
@@ -69,17 +96,17 @@ def detect(
     <shearq.Catalogue of 1 galaxies, 0 flagged: x, y, e1, e2, R11, R22, R12, R21, selection, snr, flags, pixels>
     """
     pixels = shaped("image", with_missing("image", image, mask), "(ny, nx)", axes=2)
-    star = double("psf", psf)
-    if star.ndim != 2:
+    draw = _draw_of(psf)
+    star = double("psf", psf) if draw is None else _stars(psf, draw, wcs)
+    if isinstance(star, np.ndarray) and star.ndim != 2:
         raise ValueError(f"psf: found an array of shape {shown(star.shape)}; expected (py, px)")
-    if not np.isfinite(star).all():
+    if isinstance(star, np.ndarray) and not np.isfinite(star).all():
         raise ValueError("psf: found a pixel that is not finite; expected finite ones")
     level = real("noise", noise, "a positive number of image units", least=0.0)
     rows, columns = pixels.shape
     local = None
     if wcs is not None:
-        middle = 1.0 if hasattr(wcs, "jacobian") else 0.0
-        local = jacobians(wcs, 1, np.array([(columns - 1) / 2 + middle]), np.array([(rows - 1) / 2 + middle]))[0].tolist()
+        local = _jacobians(wcs, np.array([[(columns + 1) / 2, (rows + 1) / 2]]))[0].tolist()
     single = np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
     found, doubts = _shearq.detect(single, star, level, float(threshold), local, thread_count(threads))
     for doubt in doubts:

@@ -134,7 +134,7 @@ def _range_of_stars(psf: Any) -> NDArray[np.float64] | None:
     return None
 
 
-def _doubts(psf: Any, places: NDArray[np.float64], wcs: Any, properties: Mapping[str, Any]) -> None:
+def _doubts(psf: Any, places: NDArray[np.float64], wcs: Any, properties: Mapping[str, Any], what: tuple[str, str] = ("galaxies", "galaxy")) -> None:
     """Warns of places that are not on the chip of a model, and of pixels whose WCS the model has and the call has not."""
     stars = _range_of_stars(psf)
     if stars is not None:
@@ -144,7 +144,7 @@ def _doubts(psf: Any, places: NDArray[np.float64], wcs: Any, properties: Mapping
             k = int(outside.argmax())
             (x0, y0), (x1, y1) = stars
             warn(
-                f"psf: {int(outside.sum())} of {len(places)} galaxies are far from the stars of the model: galaxy {k} is at x = {places[k, 0]:.6g},"
+                f"psf: {int(outside.sum())} of {len(places)} {what[0]} are far from the stars of the model: {what[1]} {k} is at x = {places[k, 0]:.6g},"
                 f" y = {places[k, 1]:.6g} (expected x from {x0:.6g} to {x1:.6g} and y from {y0:.6g} to {y1:.6g}, about)."
                 " Try: x=, y=, in pixels of the exposure to which the model was fitted",
                 DataWarning,

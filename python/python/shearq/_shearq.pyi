@@ -55,7 +55,7 @@ def select(
 def failed(values: _Doubles) -> NDArray[np.bool_]: ...
 def detect(
     image: NDArray[np.float32],
-    star: _Doubles,
+    psf: _Doubles | Callable[[list[tuple[float, float]]], _Doubles],
     noise: float,
     threshold: float,
     jacobian: list[list[float]] | None,

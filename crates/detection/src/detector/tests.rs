@@ -104,7 +104,7 @@ fn functionals_are_those_of_the_galaxy_without_psf() {
     let ([x0, y0], flux) = PAIR[0];
     let (x, y) = (62, 60);
     let sums = detector.sums(image.as_slice().unwrap(), 128, [x, y]);
-    let lengths = detector.lengths;
+    let lengths = detector.shared.lengths;
     let under = |sigma: f64, at: [f64; 2]| {
         let [xx, yy, xy] = GALAXY;
         let total = [xx + sigma * sigma, yy + sigma * sigma, xy];
@@ -148,7 +148,7 @@ fn light_beyond_the_square_of_the_kernels_changes_no_moment() {
         let own = Detector::new(star.view(), &noise, None, &DetectionMethod::default()).unwrap();
         let (radius, wide) = (own.radius, 30);
         let pixels = PixelShape::SQUARE;
-        let all = Functionals::new(star.view(), &noise, &own.lengths, pixels, wide);
+        let all = Functionals::new(star.view(), &noise, &own.shared.lengths, pixels, wide);
         let side = 2 * wide + 2;
         // A galaxy of stars with Gaussian weights, and one of half its light beside it.
         let mut image = Array2::<f64>::zeros((side, side));
@@ -492,5 +492,31 @@ fn stars_larger_than_their_transform_have_the_same_detections() {
     }
     for star in [Array2::ones((513, 513)), Array2::ones((48, 50))] {
         assert!(Detector::new(star.view(), &noise, None, &settings).is_err());
+    }
+}
+
+#[test]
+fn functionals_are_the_same_behind_another_star() {
+    let detector = without_noise(5.0);
+    let ([x0, y0], flux) = PAIR[0];
+    let of = |psf: [f64; 3]| {
+        let star = Array2::from_shape_fn((48, 48), |(y, x)| {
+            gaussian(psf, 1.0, [x as f64 - 23.5, y as f64 - 23.5])
+        });
+        let total = [0, 1, 2].map(|k| GALAXY[k] + psf[k]);
+        let image = Array2::from_shape_fn((128, 128), |(y, x)| {
+            gaussian(total, flux, [x as f64 - x0, y as f64 - y0]) as f32
+        });
+        let detector = detector.behind(&star);
+        detector.sums(image.as_slice().unwrap(), 128, [62, 60])
+    };
+    // Smaller by 10 % and of another shape.
+    let (one, other) = (of(PSF), of([2.0, 2.1, -0.1]));
+    for (own, found) in one.iter().zip(&other) {
+        close(
+            f64::from(*own),
+            f64::from(*found),
+            1e-4 * f64::from(one[LIGHT]),
+        );
     }
 }

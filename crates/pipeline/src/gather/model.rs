@@ -15,19 +15,19 @@ const PYTHON: &str = "SHEARQ_PYTHON";
 
 /// Which chip of a camera an exposure is, from 0, of how many.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Chip {
-    pub(super) at: usize,
-    pub(super) of: usize,
+pub(crate) struct Chip {
+    pub(crate) at: usize,
+    pub(crate) of: usize,
 }
 
-pub(super) enum PsfModel {
+pub(crate) enum PsfModel {
     Psfex(Box<PsfexModel>),
     Piff(PathBuf, Chip),
 }
 
 impl PsfModel {
     /// The model that a file contains; `None` of a file of stamps.
-    pub(super) fn read(path: &Path, chip: Chip) -> Result<Option<Self>, FileError> {
+    pub(crate) fn read(path: &Path, chip: Chip) -> Result<Option<Self>, FileError> {
         let place = Place::of(path);
         // What is wrong with a file that is no table is said when its stamps are read.
         let Ok(tables) = fits::tables(&place.path, None) else {
@@ -63,7 +63,7 @@ impl PsfModel {
 
     /// The pixels of a model at the first place, with a frame of zeros, as it is beyond them; and their number along a pixel of the image.
     /// Piff draws its models without end.
-    pub(super) fn framed(&self, places: &[(f64, f64)]) -> Option<(Array2<f64>, f64)> {
+    pub(crate) fn framed(&self, places: &[(f64, f64)]) -> Option<(Array2<f64>, f64)> {
         match (self, places) {
             (PsfModel::Psfex(model), [place, ..]) => {
                 let [columns, rows] = model.sides;
@@ -79,11 +79,37 @@ impl PsfModel {
         }
     }
 
-    /// Draws the PSF at each place, in FITS pixels, on `side` × `side` pixels around its centre.
+    /// Draws the PSF at each place, in FITS pixels, as far as it has light.
+    pub(crate) fn stars(
+        &self,
+        path: &Path,
+        places: &[(f64, f64)],
+        scale: Option<f64>,
+    ) -> Result<Vec<Array2<f64>>, FileError> {
+        let side = match self {
+            PsfModel::Psfex(model) => {
+                model.check_places(path, places)?;
+                let longest = model.sides[0].max(model.sides[1]);
+                (longest as f64 * model.step).ceil() as usize
+            }
+            PsfModel::Piff(..) => PIFF_SIDE_PX,
+        };
+        let mut stars = Vec::new();
+        self.draw(places, side, scale, |stamp| {
+            let at = |(y, x): (usize, usize)| f64::from(stamp[y * side + x]);
+            stars.push(Array2::from_shape_fn((side, side), at));
+            Ok(())
+        })?;
+        Ok(stars)
+    }
+
+    /// Draws the PSF at each place, in FITS pixels, on `side` × `side` pixels around its centre. `scale` is that of the
+    /// exposure, in arcseconds: models of Piff state their own.
     pub(super) fn draw(
         &self,
         places: &[(f64, f64)],
         side: usize,
+        scale: Option<f64>,
         mut take: impl FnMut(&[f32]) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
         match self {
@@ -96,11 +122,16 @@ impl PsfModel {
                 }
                 Ok(())
             }
-            PsfModel::Piff(path, chip) => draw_by_python(path, *chip, places, side, take),
+            PsfModel::Piff(path, chip) => draw_by_python(path, *chip, places, (side, scale), take),
         }
     }
 }
 
+// Pixels a side of a star of Piff's: beyond them, a Moffat profile of β = 2.5 with a FWHM of 4 px has 1 % of its light.
+const PIFF_SIDE_PX: usize = 64;
+// Distance from the stars of a model in units of their range, from which a place is not on its chip: as `_psf_models.py` of the Python package
+// has it.
+const MAX_EXTRAPOLATION: f64 = 1.0;
 // The column of the basis.
 const MASKS: &str = "PSF_MASK";
 // GalSim draws PSFEx's models with the same order.
@@ -112,7 +143,7 @@ const MAX_DEGREE: usize = 12;
 type Weights = Vec<(i64, Vec<f64>)>;
 
 /// A PSF whose pixels on a fine grid are polynomials of the place (Bertin 2011, ASPC 442, 435). It contains the pixel.
-pub(super) struct PsfexModel {
+pub(crate) struct PsfexModel {
     /// Of each term, row by row.
     basis: Vec<f64>,
     sides: [usize; 2],
@@ -196,6 +227,28 @@ impl PsfexModel {
         }
     }
 
+    // Far from the stars, a polynomial may have any value.
+    fn check_places(&self, path: &Path, places: &[(f64, f64)]) -> Result<(), FileError> {
+        // POLZERO is the middle of the range of the stars, and POLSCAL its width.
+        let is_far = |(x, y): &&(f64, f64)| {
+            let of_range =
+                [(x, 0), (y, 1)].map(|(at, axis)| (at - self.zero[axis]) / self.scale[axis]);
+            of_range.iter().any(|at| at.abs() > 0.5 + MAX_EXTRAPOLATION)
+        };
+        let Some((x, y)) = places.iter().find(is_far).filter(|_| self.degree > 0) else {
+            return Ok(());
+        };
+        let [of_x, of_y] = [0, 1].map(|axis| {
+            let [from, to] = [-0.5, 0.5].map(|end| self.zero[axis] + end * self.scale[axis]);
+            format!("{from:.0} to {to:.0}")
+        });
+        let message = format!(
+            "the model has no stars near x = {x:.0}, y = {y:.0} of the exposure (found stars with x from {of_x} and y from {of_y}; expected some in all parts)"
+        );
+        Err(FileError::new(path, message)
+            .hint("the model of this exposure and chip, such as --psf FILE[2]"))
+    }
+
     // On the fine grid.
     fn mask_at(&self, (x, y): (f64, f64)) -> Vec<f64> {
         let [u, v] = [(x, 0), (y, 1)].map(|(at, axis)| (at - self.zero[axis]) / self.scale[axis]);
@@ -218,6 +271,8 @@ impl PsfexModel {
         let mask = self.mask_at(place);
         let [columns, rows] = self.sides;
         let light: f64 = mask.iter().sum::<f64>() * self.step * self.step;
+        // A polynomial may be negative far from its stars. A PSF that is divided by this would look like one.
+        let light = if light > 0.0 { light } else { f64::NAN };
         // Along x first.
         let mut lines = vec![0.0; side * rows];
         for (line, row) in lines.chunks_exact_mut(side).zip(mask.chunks_exact(columns)) {
@@ -278,7 +333,7 @@ fn draw_by_python(
     path: &Path,
     chip: Chip,
     places: &[(f64, f64)],
-    side: usize,
+    (side, scale): (usize, Option<f64>),
     mut take: impl FnMut(&[f32]) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
     let python = std::env::var_os(PYTHON).unwrap_or_else(|| OsString::from("python3"));
@@ -295,6 +350,7 @@ fn draw_by_python(
         .args(["-m", "shearq._drawn_psfs"])
         .arg(path)
         .args([chip.at, chip.of, side].map(|number| number.to_string()))
+        .args(scale.map(|scale| scale.to_string()))
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn();
@@ -392,6 +448,35 @@ mod tests {
         let found = cut(0.2).unwrap();
         assert!((found.side - 8.6).abs() < 1e-9, "{found:?}");
         assert!((0.04..0.14).contains(&found.level), "{found:?}");
+    }
+
+    #[test]
+    fn a_negative_model_is_no_psf() {
+        let mut model = model(0.7);
+        model.basis.iter_mut().for_each(|value| *value = -*value);
+        let mut stamp = vec![0.0; 32 * 32];
+        model.draw((500.0, 400.0), &model.weights(32), &mut stamp);
+        assert!(stamp.iter().all(|value| value.is_nan()));
+    }
+
+    #[test]
+    fn stars_of_a_model_are_those_near_its_own() {
+        // POLZERO is (500, 400), and POLSCAL (100, 50).
+        let model = PsfModel::Psfex(Box::new(model(0.7)));
+        let stars = |place| model.stars(Path::new("model.psf"), &[(500.0, 400.0), place], None);
+        let [one, other] = &stars((649.0, 326.0)).unwrap()[..] else {
+            panic!()
+        };
+        // 43 pixels of 0.7.
+        assert_eq!((one.dim(), other.dim()), ((31, 31), (31, 31)));
+        for place in [(651.0, 400.0), (500.0, 324.0)] {
+            assert!(
+                stars(place)
+                    .unwrap_err()
+                    .to_string()
+                    .contains("found stars with x from 450 to 550 and y from 375 to 425")
+            );
+        }
     }
 
     #[test]

@@ -180,7 +180,9 @@ fn of_model(
     }
     let side = plan.stack.side.max(MIN_PSF);
     let mut writer = StarWriter::create(to, places.len(), side, &plan.stack.wcs)?;
-    model.draw(&places, side, |stamp| writer.add(stamp).map(|_| ()))?;
+    model.draw(&places, side, plan.stack.wcs.scale(), |stamp| {
+        writer.add(stamp).map(|_| ())
+    })?;
     let messages = model
         .framed(&places)
         .and_then(|(psf, fine)| truncated(path, &psf, fine));
@@ -268,14 +270,18 @@ fn light_of(pixels: &[f32], [columns, rows]: [usize; 2]) -> Array2<f64> {
 /// The warning about a PSF that ends where it has light, of which so many pixels are along a pixel of the galaxies. Interpolation to
 /// those hides the end.
 fn truncated(path: &Path, psf: &Array2<f64>, oversampling: f64) -> Option<String> {
+    let warning = truncation(psf, oversampling)?;
+    Some(format!("warning: {}: {warning}", path.display()))
+}
+
+pub(crate) fn truncation(psf: &Array2<f64>, oversampling: f64) -> Option<Warning> {
     let found = Truncation::of(psf.view(), oversampling)?;
-    let warning = Warning::PsfTruncated {
+    Some(Warning::PsfTruncated {
         side: found.side,
         level: found.level,
         effect: found.effect(),
         of: ExaminedPsfs { count: 1, of: 1 },
-    };
-    Some(format!("warning: {}: {warning}", path.display()))
+    })
 }
 
 // Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
