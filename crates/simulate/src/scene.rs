@@ -7,7 +7,7 @@
 //!
 //! Pixels count from 0 here, +x is to the west and +y to the north, so that pixel axes are those of the sky.
 //!
-//! Random numbers are ChaCha8 streams with the key (seed, scene, 0, purpose) and the index of the object as the number of the
+//! Random numbers are ChaCha8 streams with the key (seed, scene, 0, purpose), which also has the high half of the seed, and the index of the object as the number of the
 //! stream. An object therefore depends neither on the order nor on the thread in which it is drawn, nor on the others.
 
 use std::f64::consts::TAU;
@@ -27,7 +27,7 @@ use super::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
 use super::galaxy::{Galaxy, Sersic};
 use super::noise::add_noise;
 use super::render::{RenderScratch, Renderer, stamp_side};
-use super::set::{NOISE_SIGMA, SettingsError, stream};
+use super::set::{NOISE_SIGMA, SettingsError, stream_of};
 use super::signal::power;
 
 /// Pixels a side of the star image of a scene.
@@ -82,6 +82,9 @@ pub enum Layout {
 #[serde(remote = "Self", deny_unknown_fields)]
 pub struct SceneSettings {
     pub seed: u64,
+    /// 64 more bits of the seed of a blind challenge, so that nobody finds it by trying.
+    #[serde(default, skip_serializing_if = "has_no_bits")]
+    pub seed_high: u64,
     /// Pixels a side.
     pub side: usize,
     /// Pixels along the edges that are without objects before lensing; 0 populates the field beyond the edges.
@@ -127,10 +130,15 @@ fn is_constant(gradient: &[f64; 2]) -> bool {
     *gradient == [0.0; 2]
 }
 
+fn has_no_bits(half: &u64) -> bool {
+    *half == 0
+}
+
 impl Default for SceneSettings {
     fn default() -> Self {
         SceneSettings {
             seed: 1,
+            seed_high: 0,
             side: 1000,
             border: 0,
             pixel_arcsec: 0.2,
@@ -173,6 +181,7 @@ impl SceneSettings {
     pub fn validate(&self) -> Result<(), SettingsError> {
         let SceneSettings {
             seed: _,
+            seed_high: _,
             side,
             border,
             pixel_arcsec,
@@ -272,7 +281,7 @@ impl SceneSettings {
     }
 
     fn stream(&self, scene: u32, purpose: Purpose) -> ChaCha8Rng {
-        stream([self.seed, u64::from(scene), 0, purpose as u64])
+        stream_of([self.seed, self.seed_high], [scene, 0], purpose as u64)
     }
 }
 

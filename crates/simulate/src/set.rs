@@ -218,12 +218,18 @@ impl SimulationSettings {
     }
 
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
-        // Numbers of sets and images have 32 bits.
-        let high = |number: u32, bits: u64| u64::from(number) | bits << 32;
-        let set = high(set, self.seed_high);
-        let image = high(image, self.seed_high >> 32);
-        stream([self.seed, set, image, purpose as u64])
+        stream_of([self.seed, self.seed_high], [set, image], purpose as u64)
     }
+}
+
+/// Random numbers that depend on a seed of 128 bits, its low half first, on two numbers and on a purpose.
+pub(crate) fn stream_of(seed: [u64; 2], numbers: [u32; 2], purpose: u64) -> ChaCha8Rng {
+    // The numbers have 32 bits, which leaves as many of each word for the high half.
+    let with_high = |number: u32, bits: u64| u64::from(number) | bits << 32;
+    let [low, high] = seed;
+    let [first, second] = numbers;
+    let words = [with_high(first, high), with_high(second, high >> 32)];
+    stream([low, words[0], words[1], purpose])
 }
 
 /// Random numbers that depend on these words alone.
