@@ -13,8 +13,9 @@ use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
 use shearq_dataset::threads::Progress;
 use shearq_pipeline::galaxy_fits::read_fits;
-use shearq_pipeline::scenes::{SHEARS, SceneRecord, simulate_scenes, write_shears};
+use shearq_pipeline::scenes::{SHEARS, SceneFolders, SceneRecord, simulate_scenes, write_shears};
 use shearq_pipeline::simulate::simulate_images;
+use shearq_simulate::fit::Fit;
 use shearq_simulate::scene::{Layout, SceneSettings, SceneSimulator};
 use shearq_simulate::set::SimulationSettings;
 
@@ -41,6 +42,7 @@ use shearq_simulate::set::SimulationSettings;
 #[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch", "scenes"]).multiple(true))]
 #[command(group = ArgGroup::new("turnable").args(["constant_shear", "scenes"]).multiple(true))]
 #[command(group = ArgGroup::new("of_fits").args(["branch", "scenes"]))]
+#[command(group = ArgGroup::new(OTHER_DATA).args(SCENES_REFUSE).multiple(true))]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
     #[arg(long, value_name = "LIST", required_unless_present_any = ["challenge", "scenes"])]
@@ -52,6 +54,9 @@ pub(crate) struct Arguments {
     simulation: SimulationArguments,
     #[command(flatten)]
     scene: SceneArguments,
+    /// Also simulate each scene with the opposite noise, so that what is linear in the noise cancels.
+    #[arg(long, requires = "scenes", conflicts_with = OTHER_DATA)]
+    opposite_noise: bool,
     /// Shear of all galaxies, instead of a shear field or a shear per scene. May be given several times.
     #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = two_numbers, conflicts_with_all = ["amplitude", "tilt"])]
     constant_shear: Vec<[f64; 2]>,
@@ -85,53 +90,52 @@ pub(crate) struct Arguments {
 
 // Exposures of fields. Without options: 3.3 arcmin a side, 75 galaxies per arcmin², seeing 0.7 arcsec.
 #[derive(Debug, Args)]
-struct SceneArguments {
+pub(super) struct SceneArguments {
     /// Simulate this many scenes instead of sets.
-    #[arg(long, value_name = "N", conflicts_with_all = SCENES_REFUSE, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
-    scenes: Option<u32>,
+    #[arg(long, value_name = "N", conflicts_with = OTHER_DATA, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    pub(super) scenes: Option<u32>,
     /// Pixels a side of a scene.
-    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().side)]
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().side)]
     side: usize,
     /// Pixels along the edges of a scene without galaxies and stars, so that none crosses an edge under one of several shears.
-    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().border)]
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().border)]
     border: usize,
     /// Arcseconds per pixel of a scene.
-    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().pixel_arcsec)]
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().pixel_arcsec)]
     pixel: f64,
     /// FWHM of the PSF of a scene, a Moffat profile (β = 3), in arcsec.
-    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().seeing_arcsec)]
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().seeing_arcsec)]
     seeing: f64,
     /// Ellipticity ε of the PSF of a scene [default: 0.03,-0.02].
-    #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
+    #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with = OTHER_DATA, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_shape: Option<[f64; 2]>,
     /// Change of the PSF over a scene, of which model.psf is a model as PSFEx has it: relative, of the FWHM from the middle to the right
     /// edge, and of the ellipticity, of e1 on that way and of e2 to the upper edge.
-    #[arg(long, value_name = "FWHM,E", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
+    #[arg(long, value_name = "FWHM,E", requires = "scenes", conflicts_with = OTHER_DATA, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_gradient: Option<[f64; 2]>,
     /// Galaxies per arcmin².
-    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().density)]
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().density)]
     density: f64,
     /// Least and largest S/N of galaxies, each alone [default: 3,400]. The noise of a pixel is 1.
-    #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, value_parser = two_numbers)]
+    #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", conflicts_with = OTHER_DATA, value_parser = two_numbers)]
     snr: Option<[f64; 2]>,
     /// Slope of the number counts per magnitude, d log₁₀ N/d mag, between these S/N.
-    #[arg(long, value_name = "SLOPE", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().counts_slope)]
+    #[arg(long, value_name = "SLOPE", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().counts_slope)]
     counts_slope: f64,
     /// Stars per arcmin², of S/N 50 to 2000.
-    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().star_density)]
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().star_density)]
     stars: f64,
     /// Where galaxies are: `random`, or on a `hexagonal` lattice, without blends.
-    #[arg(long, value_name = "LAYOUT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value = "random", value_parser = layout())]
+    #[arg(long, value_name = "LAYOUT", requires = "scenes", conflicts_with = OTHER_DATA, default_value = "random", value_parser = layout())]
     layout: Layout,
-    /// Also simulate each scene with the opposite noise, so that what is linear in the noise cancels.
-    #[arg(long, requires = "scenes", conflicts_with_all = SCENES_REFUSE)]
-    opposite_noise: bool,
 }
 
 // Options of sets alone.
 const SETS_ONLY: [&str; 6] = ["sets", "images", "amplitude", "tilt", "fixed_psf", "shard"];
 
-// Options without a meaning for scenes.
+/// The group of options without a meaning for scenes, of each command that simulates them.
+pub(super) const OTHER_DATA: &str = "other_data";
+
 const SCENES_REFUSE: [&str; 10] = [
     "sets",
     "images",
@@ -278,8 +282,8 @@ fn scene_versions(arguments: &Arguments) -> anyhow::Result<Vec<SceneVersion>> {
             (false, true, "_noise"),
             (true, true, "_rotated_noise"),
         ] {
-            let asked_for = (!rotated || arguments.rotated)
-                && (!negative_noise || arguments.scene.opposite_noise);
+            let asked_for =
+                (!rotated || arguments.rotated) && (!negative_noise || arguments.opposite_noise);
             if asked_for {
                 versions.push(SceneVersion {
                     shear,
@@ -298,31 +302,38 @@ fn scene_versions(arguments: &Arguments) -> anyhow::Result<Vec<SceneVersion>> {
     Ok(versions)
 }
 
+impl SceneArguments {
+    pub(super) fn settings(&self, seed: u64) -> SceneSettings {
+        let default = SceneSettings::default();
+        SceneSettings {
+            seed,
+            side: self.side,
+            border: self.border,
+            pixel_arcsec: self.pixel,
+            seeing_arcsec: self.seeing,
+            psf_shape: self.psf_shape.unwrap_or(default.psf_shape),
+            psf_gradient: self.psf_gradient.unwrap_or(default.psf_gradient),
+            layout: self.layout,
+            density: self.density,
+            snr: self.snr.unwrap_or(default.snr),
+            counts_slope: self.counts_slope,
+            star_density: self.stars,
+            ..default
+        }
+    }
+}
+
+/// The fits of a table of galaxies, and its fingerprint.
+pub(super) fn fits_of(galaxies: Option<&Path>) -> anyhow::Result<(Vec<Fit>, Option<String>)> {
+    let fits = galaxies.map(read_fits).transpose()?;
+    let print = galaxies.map(fingerprint::of_file).transpose()?;
+    Ok((fits.unwrap_or_default(), print))
+}
+
 fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
-    let own = &arguments.scene;
-    let default = SceneSettings::default();
-    let settings = SceneSettings {
-        seed: arguments.simulation.settings()?.seed,
-        side: own.side,
-        border: own.border,
-        pixel_arcsec: own.pixel,
-        seeing_arcsec: own.seeing,
-        psf_shape: own.psf_shape.unwrap_or(default.psf_shape),
-        psf_gradient: own.psf_gradient.unwrap_or(default.psf_gradient),
-        layout: own.layout,
-        density: own.density,
-        snr: own.snr.unwrap_or(default.snr),
-        counts_slope: own.counts_slope,
-        star_density: own.stars,
-        ..default
-    };
-    let fits = arguments.galaxies.as_deref().map(read_fits).transpose()?;
-    let fits = fits.unwrap_or_default();
-    let galaxies = arguments
-        .galaxies
-        .as_deref()
-        .map(fingerprint::of_file)
-        .transpose()?;
+    let seed = arguments.simulation.settings()?.seed;
+    let settings = arguments.scene.settings(seed);
+    let (fits, galaxies) = fits_of(arguments.galaxies.as_deref())?;
     let mut simulators = Vec::new();
     for version in scene_versions(arguments)? {
         let settings = SceneSettings {
@@ -355,7 +366,11 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
             galaxies: galaxies.clone(),
         };
         let threads = arguments.threads.number();
-        made += simulate_scenes(simulator, &record, scenes, out, threads, &mut bar)?;
+        let folders = SceneFolders {
+            images: out,
+            truth: out,
+        };
+        made += simulate_scenes(simulator, &record, scenes, folders, threads, &mut bar)?;
     }
     drop(bar);
     let of_versions = simulators.iter().map(|(own, out)| (own, out.as_path()));

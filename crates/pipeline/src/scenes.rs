@@ -51,7 +51,15 @@ struct Chunk {
     is_last: bool,
 }
 
-/// Simulates scenes 1 to `scenes` into `out`. Returns the number of new ones.
+/// Where scenes are written to: exposures and PSF into one folder, tables of truth and settings into the other, which may be the
+/// same one.
+#[derive(Debug, Clone, Copy)]
+pub struct SceneFolders<'a> {
+    pub images: &'a Path,
+    pub truth: &'a Path,
+}
+
+/// Simulates scenes 1 to `scenes`. Returns the number of new ones.
 ///
 /// One image is in memory at a time, and what the workers have drawn ahead. Light is added in the order of the objects, so that
 /// the images are the same for any number of threads.
@@ -59,17 +67,20 @@ pub fn simulate_scenes(
     simulator: &SceneSimulator,
     record: &SceneRecord,
     scenes: u32,
-    out: &Path,
+    SceneFolders {
+        images,
+        truth: secret,
+    }: SceneFolders<'_>,
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<usize, PipelineError> {
-    let claim = claim(&out.join(SIMULATION_FILE), record, SCENE)?;
+    let claim = claim(&secret.join(SIMULATION_FILE), record, SCENE)?;
     let side = simulator.settings().side;
-    let path = |scene| out.join(fill(SCENE, 0, scene));
+    let path = |scene| images.join(fill(SCENE, 0, scene));
     let todo: Vec<u32> = (1..=scenes)
-        .filter(|scene| !(is_whole(&path(*scene), side) && truth_path(out, *scene).exists()))
+        .filter(|scene| !(is_whole(&path(*scene), side) && truth_path(secret, *scene).exists()))
         .collect();
-    write_star(simulator, record, out)?;
+    write_star(simulator, record, images)?;
     let objects = simulator.objects();
     progress.skip((scenes as usize - todo.len()) as u64 * objects as u64);
     let mut image = Array2::zeros((side, side));
@@ -113,7 +124,7 @@ pub fn simulate_scenes(
                 simulator.add_noise(chunk.scene, &mut image);
                 // The image is written last, so that its file shows that the scene is complete.
                 let table = std::mem::replace(&mut truth, TruthTable::new(simulator.settings()));
-                table.write(&truth_path(out, chunk.scene))?;
+                table.write(&truth_path(secret, chunk.scene))?;
                 write_image(record, chunk.scene, &image, &path(chunk.scene))?;
                 image.fill(0.0);
             }
