@@ -612,6 +612,7 @@ choices! {
     Kind {
         Great10: "great10", "GREAT10 Galaxy Challenge";
         Great3: "great3", "Sets with one shear each, ranked by Q_c";
+        Scenes: "scenes", "Exposures with one shear each for pipelines with detection, ranked by the shear error";
     }
     FileFormat {
         Parquet: "parquet", "Parquet";

@@ -1,13 +1,16 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{ArgGroup, Args, Subcommand};
-use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
+use shearq_challenge::create::{
+    Folders, Plan, Scenes, Simulation, of_images, of_scenes, simulated,
+};
 use shearq_challenge::entry::{Entry, check_team};
 use shearq_challenge::inbox;
 use shearq_challenge::judge::{Arrivals, Judge};
-use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, RankBy};
+use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, MAX_M, RankBy};
 use shearq_challenge::page::View;
 use shearq_challenge::ranking::{Board, Decisions, rank as ranked};
+use shearq_challenge::scenes::{self, expected_m_error};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
 use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES, now};
@@ -18,9 +21,11 @@ use shearq_render::escape::line;
 use shearq_render::table::TableFormat;
 use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
+use shearq_simulate::scene::SceneSimulator;
 
 use super::check::report;
-use crate::arguments::{Form, SetList, SummaryArguments, Threads, named, page};
+use super::simulate::{OTHER_DATA, SceneArguments, fits_of};
+use crate::arguments::{Form, SetList, SummaryArguments, Threads, named, page, positive};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
 
@@ -37,7 +42,7 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     #[command(
-        after_help = "Examples:\n  shearq challenge new --name pilot --sets 2,8 --images 20 --public pilot --private truth\n  shearq challenge new --name theirs --data rendered --public theirs --private theirs-truth"
+        after_help = "Examples:\n  shearq challenge new --name pilot --sets 2,8 --images 20 --public pilot --private truth\n  shearq challenge new --name theirs --data rendered --public theirs --private theirs-truth\n  shearq challenge new --name pipelines --kind scenes --scenes 400 --public scenes --private scenes-truth"
     )]
     New(Box<NewArguments>),
     #[command(after_help = "Example:\n  shearq challenge check entry.tar.gz --challenge pilot")]
@@ -54,10 +59,11 @@ enum Command {
 /// the true shear, the intrinsic shapes, the seed and the settings. The public folder does not determine the private
 /// folder.
 ///
-/// The images are simulated (--sets), with a seed of 128 bits that is drawn and kept in the private folder, or copied from
+/// The images are simulated (--sets, --scenes), with a seed of 128 bits that is drawn and kept in the private folder, or copied from
 /// another simulator (--data). The same command resumes a stopped simulation.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("source").required(true).args(["sets", "data"]))]
+#[command(group = ArgGroup::new("source").required(true).args(["sets", "data", "scenes"]))]
+#[command(group = ArgGroup::new(OTHER_DATA).args(SETS_ONLY).multiple(true))]
 struct NewArguments {
     /// Name of the challenge. Entries state it.
     #[arg(long, value_name = "NAME", value_parser = name)]
@@ -102,6 +108,14 @@ struct NewArguments {
     /// Tables of the true shear of --data: x, y, g1, g2, with `{set}` for the set number [default: as in the data folder].
     #[arg(long, value_name = "PATTERN", requires = "data", conflicts_with_all = ["sets", "images", "grid", "amplitude", "tilt"])]
     truth_table: Option<String>,
+    #[command(flatten)]
+    scene: SceneArguments,
+    /// Fits to galaxies from which those of scenes are drawn, as in `simulate --galaxies`.
+    #[arg(long, value_name = "FILE", requires = "scenes", conflicts_with = OTHER_DATA)]
+    galaxies: Option<PathBuf>,
+    /// Largest |m| of ranked entries of scenes, to which twice its error is added [default: 0.02].
+    #[arg(long, value_name = "M", requires = "scenes", conflicts_with = OTHER_DATA, value_parser = positive)]
+    max_m: Option<f64>,
     /// Metric that ranks entries [default: q-calibrated, or qc if each set has one shear].
     ///
     /// Neither default rewards shrunk ellipticities or entries without images. `q` does while noise dominates it, `m`
@@ -138,12 +152,29 @@ struct NewArguments {
     threads: Threads,
 }
 
+// Options without a meaning for scenes, whose entries have one metric.
+const SETS_ONLY: [&str; 10] = [
+    "sets",
+    "images",
+    "grid",
+    "amplitude",
+    "tilt",
+    "data",
+    "truth_table",
+    "metric",
+    "spectra",
+    "partial",
+];
+
 /// Check an entry, without the true shear.
 ///
 /// ENTRY is an archive (.tar.gz, .zip) or a folder of catalogues or power spectra. Grid, sets and conventions come from
 /// challenge.toml. If the images are there, they are measured for comparison, which takes as long as `48/linear/star`. This finds
 /// swapped or flipped components, exchanged rows, images without measured shapes, and distortions that are given as
 /// shear. Images that differ from SHA256SUMS and symbolic links are refused.
+///
+/// Of scenes, an entry has a catalogue of each exposure in the format of any program. Missing scenes and numbers that are not
+/// finite are found, and the command prints which column is used as what.
 ///
 /// Exit code 0: no errors, perhaps warnings; 1: errors.
 #[derive(Debug, Args)]
@@ -248,6 +279,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         opens: arguments.opens.clone(),
         closes: arguments.closes.clone(),
         partial: arguments.partial,
+        max_m: (arguments.kind == Kind::Scenes).then(|| arguments.max_m.unwrap_or(MAX_M)),
     };
     let folders = Folders {
         public: &arguments.public,
@@ -260,6 +292,9 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         tell(format_args!(
             "warning: --closes {closes} is in the past, so that all entries without an earlier receipt are late"
         ));
+    }
+    if let Some(count) = arguments.scene.scenes {
+        return new_scenes(arguments, &plan, folders, count);
     }
     let threads = arguments.threads.number();
     let challenge = match (&arguments.data, &arguments.sets, arguments.images) {
@@ -303,6 +338,72 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn new_scenes(
+    arguments: &NewArguments,
+    plan: &Plan,
+    folders: Folders<'_>,
+    count: u32,
+) -> anyhow::Result<()> {
+    let (fits, galaxies) = fits_of(arguments.galaxies.as_deref())?;
+    // The seed is drawn later, and objects do not depend on it.
+    let settings = arguments.scene.settings(0);
+    let objects = SceneSimulator::new(settings, fits.clone())?.objects();
+    let area = settings.area_arcmin2();
+    let error = expected_m_error(f64::from(count) * area);
+    let scenes = Scenes {
+        count,
+        settings,
+        fits,
+        galaxies,
+    };
+    let mut bar = Bar::new("simulating", u64::from(count) * objects as u64);
+    let threads = arguments.threads.number();
+    of_scenes(plan, &scenes, folders, threads, &mut bar)?;
+    drop(bar);
+    tell(format_args!(
+        "wrote {} of {area:.2} arcmin², which determine m to about {error:.3}, to {}; keep {} secret",
+        crate::count(count as usize, "scene"),
+        arguments.public.display(),
+        arguments.private.display()
+    ));
+    Ok(())
+}
+
+// The form of an entry of scenes.
+fn check_scenes(entry: &Path, challenge: &Challenge, is_json: bool) -> anyhow::Result<()> {
+    let sent = match challenge.open(entry) {
+        Ok(sent) => sent,
+        Err(error) => return report(&[Finding::unreadable(error)], entry, is_json),
+    };
+    let finding = |severity, message| Finding {
+        path: entry.to_owned(),
+        severity,
+        check: "catalogues",
+        message,
+    };
+    let findings = match scenes::check(&sent, &challenge.data.sets) {
+        Ok((columns, undivided)) => {
+            columns.iter().for_each(|line| tell(format_args!("{line}")));
+            let warning = undivided.map(|text| finding(Severity::Warning, text));
+            warning.into_iter().collect()
+        }
+        Err(error) => {
+            let message = scenes::shortened(&error.to_string(), &sent);
+            vec![finding(Severity::Error, message)]
+        }
+    };
+    report(&findings, entry, is_json)
+}
+
+// Signs the arrival of an entry without errors.
+fn sign(judge: Option<&Judge>, entry: &Path, team: Option<&str>) -> anyhow::Result<()> {
+    if let Some(judge) = judge {
+        let receipt = judge.sign(entry, team)?;
+        tell(format_args!("receipt: {}", receipt.display()));
+    }
+    Ok(())
+}
+
 fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     let CheckArguments {
         entry,
@@ -318,11 +419,15 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         .map(|truth| Judge::open(place, truth, threads))
         .transpose()?;
     let challenge = Challenge::read(place)?;
-    let expected = challenge.expected()?;
     // A link could name any file of the organiser's system. An absent entry is reported below.
     if is_there(entry) {
-        inbox::refuse_links(entry)?;
+        inbox::refuse_links(entry, &challenge.data)?;
     }
+    if challenge.data.scene.is_some() {
+        check_scenes(entry, &challenge, summary.is_json())?;
+        return sign(judge.as_ref(), entry, team.as_deref());
+    }
+    let expected = challenge.expected()?;
     let sent = match challenge.open(entry) {
         Ok(sent) => sent,
         Err(error) => return report(&[Finding::unreadable(error)], entry, summary.is_json()),
@@ -370,11 +475,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     }
     // Before the receipt, because it fails if there are errors: an entry that cannot be scored must not hold a place in time.
     report(&findings, entry, summary.is_json())?;
-    if let Some(judge) = judge {
-        let receipt = judge.sign(entry, team.as_deref())?;
-        tell(format_args!("receipt: {}", receipt.display()));
-    }
-    Ok(())
+    sign(judge.as_ref(), entry, team.as_deref())
 }
 
 fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
@@ -391,7 +492,7 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     }
     let (mut sendings, mut remarks) = (Vec::new(), Vec::new());
     for (paths, reference) in [(&arguments.inbox, false), (&arguments.reference, true)] {
-        let found = inbox::find(paths)?;
+        let found = inbox::find(paths, judge.challenge.data.scene.is_some())?;
         sendings.extend(found.sendings.into_iter().map(|own| (own, reference)));
         remarks.extend(found.remarks);
     }

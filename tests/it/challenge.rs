@@ -10,11 +10,11 @@ use rand_chacha::ChaCha8Rng;
 use crate::support::{Folder, contents};
 
 /// Name of the challenges.
-const NAME: &str = "pilot";
+pub(crate) const NAME: &str = "pilot";
 const SEED: u128 = 0x8912_3f0c_77aa_5e13_0d5b_9c41_e862_f3b7;
 
 /// Leaves a private folder with a seed, as a `challenge new` that was stopped.
-fn with_seed(private: &Path, seed: u128) {
+pub(crate) fn with_seed(private: &Path, seed: u128) {
     fs::create_dir(private).unwrap();
     let key = format!("name = {NAME:?}\nversion = 1\nseed = \"{seed}\"\nsecret = \"00\"\n");
     fs::write(private.join("key.toml"), key).unwrap();

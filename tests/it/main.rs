@@ -10,6 +10,7 @@
 mod bias;
 mod cases;
 mod challenge;
+mod challenge_scenes;
 mod chosen_images;
 mod constants;
 mod damaged;

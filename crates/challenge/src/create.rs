@@ -5,19 +5,22 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 use shearq_dataset::grid::{read_psfs, write_psfs};
 use shearq_dataset::images::{self, ImageId};
-use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout, fill};
+use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout, MAX_SET, fill};
 use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
 use shearq_dataset::threads::{Progress, Quiet};
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic, names_of};
+use shearq_pipeline::scenes::{SceneFolders, SceneRecord, simulate_scenes, write_shears};
 use shearq_pipeline::simulate::simulate_images;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSession, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
+use shearq_simulate::fit::Fit;
+use shearq_simulate::scene::{SceneSettings, SceneSimulator};
 use shearq_simulate::set::{FixedPsf, STAMP, SimulationSettings};
 
 use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
@@ -25,7 +28,7 @@ use crate::kind::{ConstantShears, Kind, Noise, RankBy, additive_bias, response};
 use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
-use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules};
+use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules, SceneData};
 
 #[derive(Debug, Clone)]
 pub struct Plan {
@@ -41,6 +44,8 @@ pub struct Plan {
     pub opens: Option<Deadline>,
     pub closes: Option<Deadline>,
     pub partial: bool,
+    /// Largest |m| of ranked entries of scenes.
+    pub max_m: Option<f64>,
 }
 
 #[derive(Debug, Clone)]
@@ -52,6 +57,17 @@ pub struct Simulation {
     pub amplitude: Option<f64>,
     /// Extra slope of the shear power; `None` to draw it from the seed.
     pub tilt: Option<f64>,
+}
+
+#[derive(Debug, Clone)]
+pub struct Scenes {
+    pub count: u32,
+    /// Of any seed.
+    pub settings: SceneSettings,
+    /// Galaxies are drawn from these, or from the default population if there are none.
+    pub fits: Vec<Fit>,
+    /// Fingerprint of the table of these fits.
+    pub galaxies: Option<String>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -121,6 +137,16 @@ impl Folders<'_> {
     }
 }
 
+// The seed and the key of a challenge, those of an earlier command if it was stopped.
+fn seeded(plan: &Plan, earlier: Option<Key>) -> (u128, Key) {
+    let kept = earlier
+        .as_ref()
+        .and_then(|key| key.seed.as_ref()?.parse().ok());
+    let seed: u128 = kept.unwrap_or_else(rand::random);
+    let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
+    (seed, key)
+}
+
 // A number between 0 and 1 that a seed determines, for each purpose: from the first 64 bits of a SHA-256.
 fn drawn(seed: u128, purpose: &str) -> f64 {
     let digest = Sha256::digest(format!("shearq challenge\0{purpose}\0{seed}\0"));
@@ -138,7 +164,7 @@ pub fn simulated(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Challenge, ChallengeError> {
-    plan.check()?;
+    plan.check_grid()?;
     if simulation.amplitude == Some(0.0) {
         return Err(ChallengeError::NoShear);
     }
@@ -146,12 +172,7 @@ pub fn simulated(
     if one_shear_per_set && (simulation.amplitude.is_some() || simulation.tilt.is_some()) {
         return Err(ChallengeError::NoSpectrum);
     }
-    let earlier = folders.prepare(plan)?;
-    let kept = earlier
-        .as_ref()
-        .and_then(|key| key.seed.as_ref()?.parse().ok());
-    let seed: u128 = kept.unwrap_or_else(rand::random);
-    let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
+    let (seed, key) = seeded(plan, folders.prepare(plan)?);
     let (least, most) = AMPLITUDES;
     let settings = SimulationSettings {
         seed_high: (seed >> 64) as u64,
@@ -185,6 +206,7 @@ pub fn simulated(
         grid: simulation.grid,
         stamp: STAMP,
         field_degrees: public.layout().field_degrees,
+        scene: None,
     };
     // One image of each set shows whether entries can be ranked, before hours of simulation.
     let first = images::of_simulation(&data.sets, 1);
@@ -192,6 +214,66 @@ pub fn simulated(
     let rankable = rankable(plan, &data, &public, &private, false, threads, progress)?;
     let ids = images::of_simulation(&data.sets, data.images);
     simulate_images(&record, &ids, &public, &private, threads, progress)?;
+    finish(plan, rankable, data, folders, key, threads)
+}
+
+/// Writes a challenge of scenes with a shear each. The same command resumes a stopped one. Returns the description.
+///
+/// There is one version of each scene: participants would find the shear from two under opposite shears, or from one that is
+/// turned, because shapes cancel in their mean, and from one with the opposite noise.
+pub fn of_scenes(
+    plan: &Plan,
+    scenes: &Scenes,
+    folders: Folders<'_>,
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Challenge, ChallengeError> {
+    if plan.kind != Kind::Scenes {
+        return Err(ChallengeError::ScenesOfKind(plan.kind));
+    }
+    if scenes.count > MAX_SET {
+        return Err(ChallengeError::ManyScenes(scenes.count));
+    }
+    plan.check()?;
+    let (seed, key) = seeded(plan, folders.prepare(plan)?);
+    let settings = SceneSettings {
+        seed: seed as u64,
+        seed_high: (seed >> 64) as u64,
+        ..scenes.settings
+    };
+    let simulator = SceneSimulator::new(settings, scenes.fits.clone())?;
+    let sets: Vec<u32> = (1..=scenes.count).collect();
+    let shear = |set: &u32| {
+        let g = simulator.shear(*set);
+        (*set, [g.e1, g.e2])
+    };
+    ConstantShears::new(sets.iter().map(shear).collect()).map_err(ChallengeError::Shears)?;
+    key.write(folders.private)?;
+    let record = SceneRecord {
+        version: shearq_dataset::VERSION.into(),
+        settings,
+        galaxies: scenes.galaxies.clone(),
+    };
+    let apart = SceneFolders {
+        images: folders.public,
+        truth: folders.private,
+    };
+    simulate_scenes(&simulator, &record, scenes.count, apart, threads, progress)?;
+    let version = [(&simulator, folders.private)];
+    write_shears(version.into_iter(), scenes.count, folders.private)?;
+    let data = Data {
+        sets,
+        images: 1,
+        grid: 0,
+        stamp: 0,
+        field_degrees: 0.0,
+        scene: Some(SceneData {
+            side: settings.side,
+            arcmin2: settings.area_arcmin2(),
+        }),
+    };
+    // The noise of the images is in the scatter that ranks entries, so that no error is smaller.
+    let rankable = (plan.kind.metric(true), Noise::default());
     finish(plan, rankable, data, folders, key, threads)
 }
 
@@ -206,7 +288,7 @@ pub fn of_images(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Challenge, ChallengeError> {
-    plan.check()?;
+    plan.check_grid()?;
     let about = about(data)?;
     let first = data.galaxies(about.sets[0], 1);
     if is_there(&data.root().join(SIMULATION_FILE))
@@ -265,6 +347,14 @@ pub fn of_images(
 }
 
 impl Plan {
+    // The same of a challenge of galaxies on a grid.
+    fn check_grid(&self) -> Result<(), ChallengeError> {
+        match self.kind {
+            Kind::Scenes => Err(ChallengeError::NoScenes),
+            Kind::Great10 | Kind::Great3 => self.check(),
+        }
+    }
+
     // Checks what does not depend on the data.
     fn check(&self) -> Result<(), ChallengeError> {
         if let (Some(opens), Some(closes)) = (&self.opens, &self.closes)
@@ -478,6 +568,7 @@ fn about(data: &DataFolder) -> Result<Data, ChallengeError> {
             grid: grid.n,
             stamp: grid.stamp.0 as usize,
             field_degrees: data.layout().field_degrees,
+            scene: None,
         };
         let about = about.get_or_insert_with(|| own.clone());
         if (about.images, about.grid, about.stamp) != (own.images, own.grid, own.stamp) {
@@ -554,7 +645,7 @@ fn finish(
     threads: usize,
 ) -> Result<Challenge, ChallengeError> {
     let kind = plan.kind;
-    let layout = layout_text(&data);
+    let layout = data.scene.is_none().then(|| layout_text(&data));
     let mut challenge = Challenge {
         name: plan.name.clone(),
         version: plan.version,
@@ -562,7 +653,7 @@ fn finish(
         contact: plan.contact.clone(),
         address: plan.address.clone(),
         seal: String::new(),
-        conventions: Kind::conventions(),
+        conventions: kind.conventions(),
         rules: Rules {
             metric,
             contents: kind.contents(plan.spectra),
@@ -570,15 +661,19 @@ fn finish(
             opens: plan.opens.clone(),
             closes: plan.closes.clone(),
             partial: plan.partial,
+            max_m: plan.max_m,
         },
         data,
     };
     let Folders { public, private } = folders;
-    atomic::write(private.join(LAYOUT_FILE), layout.as_bytes())?;
+    if let Some(layout) = layout {
+        for folder in [public, private] {
+            atomic::write(folder.join(LAYOUT_FILE), layout.as_bytes())?;
+        }
+    }
     key.noise = Some(noise);
     key.files = sums(private, names(private)?, threads)?;
     challenge.seal = key.seal();
-    atomic::write(public.join(LAYOUT_FILE), layout.as_bytes())?;
     atomic::write(public.join("README.md"), readme(&challenge).as_bytes())?;
     let path = public.join(CHALLENGE_FILE);
     atomic::write(&path, challenge.text(&path)?.as_bytes())?;

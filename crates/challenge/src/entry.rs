@@ -11,9 +11,12 @@ use shearq_submissions::check_name;
 use unicode_normalization::UnicodeNormalization;
 use unicode_normalization::char::is_combining_mark;
 
+use crate::kind::{ConstantShears, Measured, Noise, Published, RankBy};
+use crate::scenes::SceneScore;
+
 /// What identifies an entry that was compared with the true shear. The store keeps it with its scores, so the names are
 /// part of the format.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EntryInfo {
     pub challenge: String,
     pub team: String,
@@ -38,6 +41,9 @@ pub struct EntryInfo {
     pub scored: bool,
     /// What the comparison showed besides the score. It depends on the truth, so it is for the organiser alone.
     pub findings: Vec<String>,
+    /// What ranks an entry of scenes, which has no metrics of sets.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenes: Option<SceneScore>,
 }
 
 impl EntryInfo {
@@ -53,6 +59,28 @@ pub struct Entry {
     pub sets: Vec<SetRecord>,
     /// Why the organiser withdrew it.
     pub withdrawn: Option<String>,
+}
+
+impl Entry {
+    /// Value and standard error of a metric. `constant` has the true shears of sets with one shear each.
+    pub fn value(&self, metric: RankBy, constant: Option<&ConstantShears>) -> Measured {
+        match &self.info.scenes {
+            Some(scenes) => scenes.value(metric),
+            None => metric.of(&self.sets, constant),
+        }
+    }
+
+    /// The same as it is published. `noise` has the errors of a measurement with the noise of the images.
+    pub fn published(
+        &self,
+        metric: RankBy,
+        constant: Option<&ConstantShears>,
+        noise: &Noise,
+    ) -> Published {
+        let (value, error) = self.value(metric, constant);
+        // `max` of an unknown error is the other one.
+        Published::new(value, error.max(metric.least_error(value, noise)))
+    }
 }
 
 /// An entry that was not compared with the true shear.

@@ -1,5 +1,6 @@
 //! Why a challenge cannot be made or ranked.
 
+use shearq_dataset::layout::MAX_SET;
 use shearq_dataset::threads::ThreadError;
 use shearq_files::FileError;
 use shearq_pipeline::PipelineError;
@@ -8,6 +9,7 @@ use shearq_results::score::ScoreError;
 use shearq_scoring::ScoringError;
 use thiserror::Error;
 
+use crate::kind::Kind;
 use crate::terms::Deadline;
 
 // Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
@@ -35,6 +37,12 @@ pub enum ChallengeError {
     NoShear,
     #[error("--amplitude and --tilt are those of a field of shears, but --kind great3 has one shear per set{}", tried(self.hint()))]
     NoSpectrum,
+    #[error("--kind scenes needs the number of scenes{}", tried(self.hint()))]
+    NoScenes,
+    #[error("--scenes is of another kind of challenge (found --kind {}){}", .0.name(), tried(self.hint()))]
+    ScenesOfKind(Kind),
+    #[error("--scenes: found {0}, expected at most {MAX_SET}")]
+    ManyScenes(u32),
     #[error(
         "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
     )]
@@ -81,6 +89,8 @@ impl ChallengeError {
         Self::Score(error) => return error.hint(),
         Self::Pipeline(error) => return error.hint(),
         Self::NoSpectrum => "without them",
+        Self::NoScenes => "--scenes N",
+        Self::ScenesOfKind(..) => "--kind scenes",
         Self::NotOfSpectra { .. } => "--metric q or q-corrected",
         Self::Undefined { constant, .. } => match constant {
             true => "--metric qc, m or c",

@@ -1,5 +1,6 @@
 //! Finds the entries that teams sent, and identifies them by their content.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -9,7 +10,9 @@ use shearq_files::atomic::list;
 use shearq_results::submit::archive::{ArchiveFormat, is_archive, is_of_system, read_archive};
 use shearq_results::submit::{FileSum, Kind, MANIFEST_FILE, Manifest};
 
+use crate::scenes;
 use crate::seal::{Receipt, sha256};
+use crate::terms::Data;
 
 // Folders below a given folder that are searched. Links are not followed, so that only a mistake is deeper. Chosen by hand.
 const MAX_DEPTH: usize = 16;
@@ -35,9 +38,9 @@ pub struct Found {
     pub remarks: Vec<(PathBuf, String)>,
 }
 
-/// Finds archives and folders of catalogues or spectra below `paths`. In an inbox, the folder of an archive is the name of
-/// its team.
-pub fn find(paths: &[PathBuf]) -> Result<Found, FileError> {
+/// Finds archives and folders of catalogues or spectra below `paths`, or of catalogues of scenes (`of_scenes`), which may be in
+/// folders. In an inbox, the folder of an archive is the name of its team.
+pub fn find(paths: &[PathBuf], of_scenes: bool) -> Result<Found, FileError> {
     let mut found = Found::default();
     for path in paths {
         if !path.exists() {
@@ -45,7 +48,7 @@ pub fn find(paths: &[PathBuf]) -> Result<Found, FileError> {
             return Err(FileError::new(path, message));
         }
         match path.is_dir() {
-            true => found.search(path, None, 0)?,
+            true => found.search(path, of_scenes, None, 0)?,
             false => found.add(path, None, 0),
         }
     }
@@ -76,7 +79,13 @@ impl Found {
     }
 
     // A folder is an entry if it contains files and no entries.
-    fn search(&mut self, folder: &Path, team: Option<&str>, depth: usize) -> Result<(), FileError> {
+    fn search(
+        &mut self,
+        folder: &Path,
+        of_scenes: bool,
+        team: Option<&str>,
+        depth: usize,
+    ) -> Result<(), FileError> {
         if depth > MAX_DEPTH {
             self.remark(
                 folder.to_owned(),
@@ -86,6 +95,10 @@ impl Found {
         }
         let mut inside = list(folder)?;
         inside.sort();
+        if of_scenes && scenes::is_entry(&inside) {
+            self.add(folder, team, depth);
+            return Ok(());
+        }
         let (mut folders, mut archives, mut loose) = (Vec::new(), Vec::new(), Vec::new());
         for path in inside {
             if is_hidden(&path) {
@@ -126,7 +139,8 @@ impl Found {
         for path in &folders {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             // The outermost folder is the inbox itself.
-            self.search(path, Some(team.unwrap_or(&name)), depth + 1)?;
+            let team = Some(team.unwrap_or(&name));
+            self.search(path, of_scenes, team, depth + 1)?;
         }
         if self.sendings.len() == before && !loose.is_empty() {
             self.add(folder, team, depth);
@@ -169,26 +183,27 @@ fn contains_entries(folder: &Path, depth: usize) -> bool {
 
 /// Refuses an entry that is a symbolic link or contains one: it could name any file of the organiser's system, such as
 /// the truth.
-pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
-    let mut paths = vec![entry.to_owned()];
-    if entry.is_dir() {
-        paths.extend(list(entry)?);
+pub fn refuse_links(entry: &Path, data: &Data) -> Result<(), FileError> {
+    let mut paths = VecDeque::from([entry.to_owned()]);
+    while let Some(path) = paths.pop_front() {
+        if path.is_symlink() {
+            let message = "this is a link; expected a file or a folder";
+            return Err(FileError::new(path, message));
+        }
+        if path.is_dir() && (path == entry || data.scene.is_some()) {
+            paths.extend(list(&path)?);
+        }
     }
-    match paths.into_iter().find(|path| path.is_symlink()) {
-        Some(link) => Err(FileError::new(
-            link,
-            "this is a link; expected a file or a folder",
-        )),
-        None => Ok(()),
-    }
+    Ok(())
 }
 
-/// The SHA-256 of an archive, or of the list of a folder's files, which have at most `most` bytes together: a file of holes has
-/// any size and costs its sender nothing.
-pub fn identify(path: &Path, most: u64) -> Result<String, FileError> {
-    refuse_links(path)?;
+/// The SHA-256 of an archive, or of the list of a folder's files, which have the bytes of the largest entry together at most: a
+/// file of holes has any size and costs its sender nothing.
+pub fn identify(path: &Path, data: &Data) -> Result<String, FileError> {
+    refuse_links(path, data)?;
+    let most = data.largest_entry();
     let files = match path.is_dir() {
-        true => files_of(path)?,
+        true => files_of(path, data)?,
         false => vec![path.to_owned()],
     };
     let size = |file: &PathBuf| file.metadata().map_or(0, |about| about.len());
@@ -200,15 +215,15 @@ pub fn identify(path: &Path, most: u64) -> Result<String, FileError> {
         return Err(FileError::new(path, message));
     }
     Ok(match path.is_dir() {
-        true => sha256(&list_of(&FileSum::of_files(&files)?)),
+        true => sha256(&list_of(&sums_of(path, &files)?)),
         false => FileSum::of(path)?.sha256,
     })
 }
 
 /// When the newest file of an entry was changed.
-pub fn modified(path: &Path) -> Result<SystemTime, FileError> {
+pub fn modified(path: &Path, data: &Data) -> Result<SystemTime, FileError> {
     let mut files = match path.is_dir() {
-        true => files_of(path)?,
+        true => files_of(path, data)?,
         false => Vec::new(),
     };
     if files.is_empty() {
@@ -223,11 +238,23 @@ pub fn modified(path: &Path) -> Result<SystemTime, FileError> {
 }
 
 // The files of an entry that is a folder, in order of their names.
-fn files_of(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+fn files_of(folder: &Path, data: &Data) -> Result<Vec<PathBuf>, FileError> {
+    if data.scene.is_some() {
+        return scenes::files(folder);
+    }
     let mut paths = list(folder)?;
     paths.retain(|path| path.is_file() && !is_hidden(path));
     paths.sort();
     Ok(paths)
+}
+
+// Checksums of the files of a folder, by their names below it.
+fn sums_of(folder: &Path, files: &[PathBuf]) -> Result<Vec<(String, FileSum)>, FileError> {
+    let sum = |file: &PathBuf| {
+        let name = file.strip_prefix(folder).unwrap_or(file).to_string_lossy();
+        Ok((name.into_owned(), FileSum::of(file)?))
+    };
+    files.iter().map(sum).collect()
 }
 
 fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
@@ -245,22 +272,25 @@ pub struct Content {
     pub manifest: Option<Manifest>,
 }
 
-/// Reads the manifest of an entry that unpacks to `most` bytes at most, and the checksum of its content.
-pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
+/// Reads the manifest of an entry that unpacks to the size of the largest entry at most, and the checksum of its content.
+pub fn content(sending: &Sending, data: &Data) -> Result<Content, FileError> {
     let path = &sending.path;
 
     let (manifest, files) = match path.is_dir() {
         // Catalogues of `measure` have other names and contents than catalogues of an entry.
-        true if path.join(RUN_FILE).is_file() => {
+        true if data.scene.is_none() && path.join(RUN_FILE).is_file() => {
             let message = "this folder was written by `measure` or `run`; expected an entry";
             return Err(FileError::new(path, message).hint(format!(
                 "shearq pack --measured {0} --out {0}.tar.gz",
                 path.display()
             )));
         }
-        true => (Manifest::read(path)?, FileSum::of_files(&files_of(path)?)?),
+        true => (
+            Manifest::read(path)?,
+            sums_of(path, &files_of(path, data)?)?,
+        ),
         false if has_archive(path) => {
-            let unpacked = read_archive(path, None, Some(most))?;
+            let unpacked = read_archive(path, None, Some(data.largest_entry()))?;
             unpacked.verify(path, false)?;
             (unpacked.manifest, unpacked.files.into_iter().collect())
         }
@@ -277,6 +307,9 @@ pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
             let name = match Kind::of(Path::new(&name)) {
                 Some(Kind::Catalogue { set, image, .. }) => format!("{set} {image}"),
                 Some(Kind::Spectrum { set, .. }) => format!("{set}"),
+                // Of scenes, the record of a run names files of the sender's disk. Archives have no folders.
+                None if data.scene.is_some() && name == RUN_FILE => return None,
+                None if data.scene.is_some() => name.rsplit('/').next()?.to_owned(),
                 // Checks see these files, so an entry with them is another entry.
                 None => format!("other {name}"),
             };
@@ -294,6 +327,16 @@ pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
 mod tests {
     use super::*;
 
+    // A challenge of one image of 8² galaxies.
+    const DATA: Data = Data {
+        sets: Vec::new(),
+        images: 1,
+        grid: 8,
+        stamp: 48,
+        field_degrees: 10.0,
+        scene: None,
+    };
+
     #[test]
     fn the_content_covers_all_files_but_the_manifest() {
         let root = tempfile::tempdir().unwrap();
@@ -303,7 +346,7 @@ mod tests {
             for file in files {
                 std::fs::write(path.join(file), "1 1 0 0\n").unwrap();
             }
-            content(&Sending { path, team: None }, 1 << 20)
+            content(&Sending { path, team: None }, &DATA)
                 .unwrap()
                 .sha256
         };
@@ -329,7 +372,7 @@ mod tests {
             let path = path.strip_prefix(root.path()).unwrap();
             path.display().to_string()
         };
-        let Found { sendings, remarks } = find(&[root.path().to_owned()]).unwrap();
+        let Found { sendings, remarks } = find(&[root.path().to_owned()], false).unwrap();
         let entries = sendings
             .iter()
             .map(|own| (name(&own.path), own.team.clone()));
@@ -381,7 +424,7 @@ mod tests {
             "notes.txt",
         ];
         assert_eq!(remarks, expected);
-        assert!(find(&[PathBuf::from("absent")]).is_err());
+        assert!(find(&[PathBuf::from("absent")], false).is_err());
     }
 
     #[test]
@@ -407,7 +450,7 @@ mod tests {
         let file = std::fs::File::create(&path).unwrap();
         file.set_len(1 << 40).unwrap();
         for entry in [path.as_path(), folder.path()] {
-            let error = identify(entry, 1 << 20).unwrap_err();
+            let error = identify(entry, &DATA).unwrap_err();
             assert!(error.text().contains("too large"), "{error}");
         }
     }

@@ -20,7 +20,7 @@ use shearq_results::submit::{
     Contents, Entry as Team, Manifest, Packed, Sent, Submission, read_bandpowers,
 };
 use shearq_scoring::{
-    Choice, Convention, Fault, Grid, Line, Noise, Options, SCORED, SetScorer, TrueShear,
+    Choice, Convention, Fault, Line, Noise, Options, SCORED, SetScorer, TrueShear,
 };
 use shearq_submissions::check_name;
 
@@ -28,8 +28,9 @@ use crate::entry::{Entry, EntryInfo, Refused, check_team, team_key};
 use crate::error::{ChallengeError, unscored};
 use crate::inbox::{Content, Sending, content, identify, modified};
 use crate::kind::{ConstantShears, response};
+use crate::scenes::{self, SceneScore};
 use crate::seal::{Key, Receipt, close, verify};
-use crate::terms::{Challenge, Deadline, now};
+use crate::terms::{CHALLENGE_FILE, Challenge, Deadline, SceneData, now};
 
 // A store keeps entries and runs in one format. Only the settings of an entry start with this.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
@@ -70,7 +71,6 @@ pub struct Judge {
     pub challenge: Challenge,
     pub key: Key,
     id: String,
-    grid: Grid,
     truths: BTreeMap<u32, Truth>,
     /// The true shears, if the shear is constant over each set.
     pub constant: Option<ConstantShears>,
@@ -119,6 +119,17 @@ impl Judge {
     pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, ChallengeError> {
         let challenge = Challenge::read(public)?;
         let (key, id) = verify(public, private, &challenge, threads)?;
+        let wrong = |message| FileError::new(private, message);
+        if challenge.data.scene.is_some() {
+            let shears = ConstantShears::new(scenes::true_shears(private)?).map_err(wrong)?;
+            return Ok(Judge {
+                challenge,
+                key,
+                id,
+                truths: BTreeMap::new(),
+                constant: Some(shears),
+            });
+        }
         let data = DataFolder::open(private)?;
         let source = Source::folder(&data, private)?;
         let grid = challenge.data.grid().map_err(unscored)?;
@@ -139,13 +150,11 @@ impl Judge {
             truths.insert(set, truth);
         }
         let shears = truths.iter().map(|(set, truth)| (*set, &truth.shear));
-        let constant =
-            ConstantShears::of(shears).map_err(|message| FileError::new(private, message))?;
+        let constant = ConstantShears::of(shears).map_err(wrong)?;
         Ok(Judge {
             challenge,
             key,
             id,
-            grid,
             truths,
             constant,
         })
@@ -269,7 +278,7 @@ impl Judge {
         now: Timestamp,
     ) -> Result<(Arrival, Option<String>), FileError> {
         let path = &sending.path;
-        let sha256 = identify(path, self.challenge.data.largest_entry())?;
+        let sha256 = identify(path, &self.challenge.data)?;
         let receipt = Receipt::read(&self.key, path, &sha256).and_then(|receipt| {
             match (&receipt, &sending.team) {
                 (Some(receipt), Some(team)) if team_key(&receipt.team) != team_key(team) => {
@@ -296,7 +305,7 @@ impl Judge {
             (Some(receipt), _) => receipt.received,
             (None, Arrivals::Now) => now,
             (None, Arrivals::At(time)) => time,
-            (None, Arrivals::OfFiles) => Timestamp::try_from(modified(path)?)
+            (None, Arrivals::OfFiles) => Timestamp::try_from(modified(path, &self.challenge.data)?)
                 .ok()
                 .and_then(|time| Timestamp::from_second(time.as_second()).ok())
                 .unwrap_or(now),
@@ -312,13 +321,13 @@ impl Judge {
     /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
     /// receipt that the same content has already is kept, unless it is of a time before entries are accepted.
     pub fn sign(&self, entry: &Path, team: Option<&str>) -> Result<PathBuf, FileError> {
-        let most = self.challenge.data.largest_entry();
-        let sha256 = identify(entry, most)?;
+        let data = &self.challenge.data;
+        let sha256 = identify(entry, data)?;
         let sending = Sending {
             path: entry.to_owned(),
             team: team.map(str::to_owned),
         };
-        let team = team_of(&sending, Some(&content(&sending, most)?), None);
+        let team = team_of(&sending, Some(&content(&sending, data)?), None);
         check_team(&team).map_err(|error| FileError::new(entry, error))?;
         let counts = |received| !self.challenge.rules.is_early(received);
         match Receipt::earlier(&self.key, entry, &sha256)? {
@@ -348,7 +357,7 @@ impl Judge {
                     && info.received <= arrival.received
             })
         };
-        let most = self.challenge.data.largest_entry();
+        let data = &self.challenge.data;
         let identified = pool.in_order(sendings, |(sending, reference)| {
             let found = self.arrival(sending, arrivals, now).and_then(|arrival| {
                 // Without a folder or a receipt, the manifest states the team.
@@ -356,7 +365,7 @@ impl Judge {
                 let team = sending.team.as_ref().or(of_receipt);
                 let content = match team.is_some_and(|team| is_scored(team, &arrival.0)) {
                     true => None,
-                    false => Some(content(sending, most)?),
+                    false => Some(content(sending, data)?),
                 };
                 Ok((arrival, content))
             });
@@ -496,6 +505,7 @@ impl Judge {
             reference: *reference,
             scored: false,
             findings: Vec::new(),
+            scenes: None,
         };
         let Verdict {
             mut sets,
@@ -505,7 +515,12 @@ impl Judge {
         check_name(&info.method).map_err(|error| refuse(error.to_string()))?;
         (info.scored, info.findings) = (scored, findings);
         if sets.is_empty() {
-            let all = &self.challenge.data.sets;
+            let data = &self.challenge.data;
+            // Scores of scenes are in `info`.
+            let all = match data.scene {
+                Some(_) => &[0][..],
+                None => &data.sets,
+            };
             sets = all.iter().map(|set| SetRecord::unknown(*set)).collect();
         }
         let configuration = truncated(&format!("{}: {}", info.team, info.method));
@@ -542,6 +557,10 @@ impl Judge {
         }
         let plain = |error| reason_of_error(&error, sending);
         let sent = self.challenge.open(&sending.path).map_err(plain)?;
+        if let Some(scene) = &self.challenge.data.scene {
+            info.method = stem(&sending.path);
+            return self.scenes(&sent, scene, info);
+        }
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
         info.method = submission.method;
@@ -562,10 +581,8 @@ impl Judge {
         if *scored && info.contents == Contents::Catalogues {
             let constant = self.constant.as_ref();
             let (value, error) = response(sets, constant);
-            if !is_measurable(value, error) {
-                findings.push(format!(
-                    "the response to the shear is consistent with zero (found {value:.3} ± {error:.3}, expected at least {MIN_ENTRY_SLOPE_SIGNIFICANCE}σ)"
-                ));
+            if let Some(finding) = no_response(value, error) {
+                findings.push(finding);
                 *scored = false;
             } else if !rules.metric.of(sets, constant).0.is_finite() {
                 findings.push(format!(
@@ -573,6 +590,33 @@ impl Judge {
                     rules.metric.label()
                 ));
                 *scored = false;
+            }
+        }
+        Ok(verdict)
+    }
+
+    // Scores the catalogues of scenes.
+    fn scenes(
+        &self,
+        sent: &Sent,
+        scene: &SceneData,
+        info: &mut EntryInfo,
+    ) -> Result<Verdict, String> {
+        let shears = self.constant.as_ref();
+        let shear = |scene| shears.map_or([f64::NAN; 2], |all| all.of_set(scene));
+        let summed = scenes::summed(sent, &self.challenge.data.sets, shear)
+            .map_err(|error| scenes::shortened(&error.to_string(), sent))?;
+        let mut verdict = Verdict::default();
+        match SceneScore::new(&summed, scene.arcmin2) {
+            Err(error) => {
+                let text = scenes::shortened(&error.to_string(), sent);
+                verdict.findings.push(text);
+            }
+            Ok(score) => {
+                let (m, error) = score.m;
+                verdict.findings.extend(no_response(1.0 + m, error));
+                verdict.scored = verdict.findings.is_empty();
+                info.scenes = Some(score);
             }
         }
         Ok(verdict)
@@ -632,13 +676,15 @@ impl Judge {
         files: &BTreeMap<u32, PathBuf>,
         manifest: Option<&Manifest>,
     ) -> Result<Verdict, FileError> {
+        let grid = self.challenge.data.grid();
+        let grid = grid.map_err(|error| FileError::new(CHALLENGE_FILE, error))?;
         let mut verdict = Verdict::default();
         let mut powers = Vec::new();
         for (&set, path) in files {
             let Some(truth) = self.truths.get(&set) else {
                 continue;
             };
-            let sent = read_bandpowers(path, &self.grid)?;
+            let sent = read_bandpowers(path, &grid)?;
             let covariance =
                 manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
             let score = truth
@@ -702,6 +748,13 @@ fn is_measurable(slope: f64, error: f64) -> bool {
     slope > 0.0 && (error.is_nan() || slope > MIN_ENTRY_SLOPE_SIGNIFICANCE * error)
 }
 
+// What is wrong with a response that is not measurable.
+fn no_response(value: f64, error: f64) -> Option<String> {
+    (!is_measurable(value, error)).then(|| format!(
+        "the response to the shear is consistent with zero (found {value:.3} ± {error:.3}, expected at least {MIN_ENTRY_SLOPE_SIGNIFICANCE}σ)"
+    ))
+}
+
 type Powers = (Vec<f64>, Vec<f64>);
 
 // Slope of the sent bandpowers on the true ones over sets, and its standard error from the residuals. Each bandpower is divided
@@ -741,12 +794,15 @@ fn team_of(sending: &Sending, content: Option<&Content>, receipt: Option<&Receip
     folder
         .or_else(|| receipt.map(|receipt| receipt.team.clone()))
         .or_else(|| stated.map(|entry| entry.team.clone()))
-        .unwrap_or_else(|| {
-            let name = file_name(&sending.path);
-            let endings = [".tar.gz", ".tgz", ".zip"];
-            let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
-            stem.unwrap_or(&name).to_owned()
-        })
+        .unwrap_or_else(|| stem(&sending.path))
+}
+
+// The name of an entry, without the ending of an archive.
+fn stem(path: &Path) -> String {
+    let name = file_name(path);
+    let endings = [".tar.gz", ".tgz", ".zip"];
+    let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
+    stem.unwrap_or(&name).to_owned()
 }
 
 fn file_name(path: &Path) -> String {

@@ -21,6 +21,8 @@ pub enum RankBy {
     /// c, the modulus of the additive bias, divided by the response: otherwise shrunk shapes have less of it.
     C,
     Qc,
+    /// Error of a shear component from 1 arcmin², of scenes.
+    ShearError,
 }
 
 impl RankBy {
@@ -39,6 +41,7 @@ impl RankBy {
             RankBy::M => "|m|",
             RankBy::C => "c",
             RankBy::Qc => "Q_c",
+            RankBy::ShearError => "σ·√arcmin²",
         }
     }
 
@@ -60,6 +63,9 @@ impl RankBy {
             RankBy::Qc => {
                 "Q_c is GREAT3's quality factor of constant shear, 2464/√(Σ (m/0.002)² + Σ (c/0.0002)² + 4) over both components."
             }
+            RankBy::ShearError => {
+                "σ·√arcmin² is the error of a shear component from 1 arcmin², by the scatter of the measured shears of scenes around a line through the true ones, divided by 1 + m."
+            }
         }
     }
 
@@ -79,6 +85,8 @@ impl RankBy {
         match self {
             RankBy::M | RankBy::C => true,
             RankBy::Qc => constant,
+            // Of scenes alone, which have no other metric.
+            RankBy::ShearError => false,
             RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated => !constant,
         }
     }
@@ -104,6 +112,7 @@ impl RankBy {
                 (modulus / response, error / response)
             }
             RankBy::Qc => constant.map_or((f64::NAN, f64::NAN), |shears| shears.q_c(sets)),
+            RankBy::ShearError => (f64::NAN, f64::NAN),
         }
     }
 
@@ -115,6 +124,8 @@ impl RankBy {
             RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated => 2.0 * value * noise.response,
             RankBy::M => noise.response,
             RankBy::C => noise.c,
+            // A scatter around the truth, which nobody can make smaller than that of the measurement.
+            RankBy::ShearError => 0.0,
             RankBy::Qc => {
                 // Q = Q₀/√(S/4 + 1), with S the sum of the squares of m and c in units of the requirements. Errors u of m and c in
                 // these units add up to 2u√S + u² to S.
@@ -127,18 +138,6 @@ impl RankBy {
         }
     }
 
-    /// Value and error over all sets, as they are published.
-    pub fn published(
-        self,
-        sets: &[SetRecord],
-        constant: Option<&ConstantShears>,
-        noise: &Noise,
-    ) -> Published {
-        let (value, error) = self.of(sets, constant);
-        // `max` of an unknown error is the other one.
-        Published::new(value, error.max(self.least_error(value, noise)))
-    }
-
     /// Value of an entry of zeros, whose mean Q is `q`: its m is −1 and its c is 0. NaN where the metric divides by the
     /// response.
     pub fn of_zero_shear(self, q: f64) -> f64 {
@@ -146,7 +145,7 @@ impl RankBy {
             RankBy::Q | RankBy::QCorrected => q,
             RankBy::M => 1.0,
             RankBy::Qc => Observation::Ground.q_c([[0.0, -1.0]; 2]),
-            RankBy::QCalibrated | RankBy::C => f64::NAN,
+            RankBy::QCalibrated | RankBy::C | RankBy::ShearError => f64::NAN,
         }
     }
 
@@ -154,7 +153,7 @@ impl RankBy {
         match self {
             RankBy::Q | RankBy::QCorrected => Some(Paired::Q),
             RankBy::QCalibrated => Some(Paired::Calibrated),
-            RankBy::M | RankBy::C | RankBy::Qc => None,
+            RankBy::M | RankBy::C | RankBy::Qc | RankBy::ShearError => None,
         }
     }
 }
@@ -240,6 +239,10 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
 // Published values determine the truth entry by entry (docs/run-a-challenge.md).
 pub const ENTRIES_PER_TEAM: u32 = 10;
 
+/// Largest |m| of ranked entries of scenes, unless the organiser chooses another number.
+// That of sep without a cut (docs/scenes.md): a challenge of some hundred scenes determines m to 0.02, and cannot require less.
+pub const MAX_M: f64 = 0.02;
+
 /// A kind of challenge: all in which challenges of different kinds differ. Its values are the defaults of a new challenge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -249,6 +252,8 @@ pub enum Kind {
     /// Sets with one shear each, ranked by Q_c, as the branches of GREAT3 with constant shear (Mandelbaum et al. 2014). The images
     /// have GREAT10's layout.
     Great3,
+    /// Exposures with one shear each, on which whole pipelines with their detection compete, ranked by their shear error.
+    Scenes,
 }
 
 impl Kind {
@@ -257,6 +262,7 @@ impl Kind {
         match self {
             Kind::Great10 => "great10",
             Kind::Great3 => "great3",
+            Kind::Scenes => "scenes",
         }
     }
 
@@ -264,6 +270,7 @@ impl Kind {
         match self {
             Kind::Great10 => "GREAT10 Galaxy Challenge",
             Kind::Great3 => "GREAT3-like challenge of constant shear",
+            Kind::Scenes => "challenge of scenes",
         }
     }
 
@@ -275,6 +282,7 @@ impl Kind {
             Kind::Great10 => RankBy::QCalibrated,
             // Not defined for a shear that varies, so that such data are refused.
             Kind::Great3 => RankBy::Qc,
+            Kind::Scenes => RankBy::ShearError,
         }
     }
 
@@ -288,13 +296,13 @@ impl Kind {
                     Contents::CrossSpectra,
                 ]
             }
-            Kind::Great10 | Kind::Great3 => vec![Contents::Catalogues],
+            Kind::Great10 | Kind::Great3 | Kind::Scenes => vec![Contents::Catalogues],
         }
     }
 
-    /// Conventions of entries, for participants: GREAT10's, for all kinds.
-    pub fn conventions() -> BTreeMap<String, String> {
-        let conventions = [
+    /// Conventions of entries, for participants: GREAT10's, without those of stamps and spectra for scenes.
+    pub fn conventions(self) -> BTreeMap<String, String> {
+        let mut conventions = vec![
             (
                 "positions",
                 "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
@@ -307,9 +315,13 @@ impl Kind {
             ("e2", "positive along x = y"),
             ("power", "l^2 C_l / (2 pi) with l in radian^-1"),
         ];
-        conventions
-            .map(|(name, text)| (name.to_owned(), text.to_owned()))
-            .into()
+        if self == Kind::Scenes {
+            conventions.retain(|(name, _)| name.starts_with('e'));
+        }
+        let owned = conventions
+            .into_iter()
+            .map(|(name, text)| (name.to_owned(), text.to_owned()));
+        owned.collect()
     }
 
     /// What participants may assume about the shear, in a sentence.
@@ -319,6 +331,9 @@ impl Kind {
                 "All images of a set have one shear field, so methods may average over them."
             }
             Kind::Great3 => "All galaxies of a set have one shear; no two sets have the same.",
+            Kind::Scenes => {
+                "All galaxies of a scene have one shear with 0.01 < |g| < 0.05, which acts on their shapes and on their places; no two scenes have the same."
+            }
         }
     }
 }
@@ -355,6 +370,11 @@ impl ConstantShears {
                 all.len()
             ));
         }
+        ConstantShears::new(shears).map(Some)
+    }
+
+    /// The shears of sets that have one each.
+    pub fn new(shears: BTreeMap<u32, [f64; 2]>) -> Result<Self, String> {
         for k in 0..2 {
             let mut values: Vec<f64> = shears.values().map(|shear| shear[k]).collect();
             values.sort_by(f64::total_cmp);
@@ -367,7 +387,12 @@ impl ConstantShears {
                 ));
             }
         }
-        Ok(Some(ConstantShears(shears)))
+        Ok(ConstantShears(shears))
+    }
+
+    /// The shear of a set; NaN without the set.
+    pub fn of_set(&self, set: u32) -> [f64; 2] {
+        self.0.get(&set).copied().unwrap_or([f64::NAN; 2])
     }
 
     /// m and c of component `k` (0 or 1): least squares of ⟨e⟩ − g = m·g + c over the sets, unweighted as in GREAT3. Errors

@@ -13,8 +13,9 @@ use shearq_results::views::comparison::per_set_plot;
 use crate::entry::{EntryInfo, Refused};
 use crate::kind::{ConstantShears, Noise, Published, RankBy};
 use crate::ranking::{Board, Leaderboard, Scored, Standing, better};
+use crate::scenes::{SceneScore, expected_m_error};
 use crate::seal::close;
-use crate::terms::{Challenge, Data};
+use crate::terms::{Challenge, Data, SceneData};
 
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
@@ -42,6 +43,7 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
         RankBy::M => ("m", "m_error"),
         RankBy::C => ("c", "c_error"),
         RankBy::Qc => ("qc", "qc_error"),
+        RankBy::ShearError => ("shear_error", "shear_error_error"),
     }
 }
 
@@ -140,13 +142,20 @@ impl View<'_> {
                 continue;
             }
             add(key(other).0, other.label(), Cell::Empty, &|standing| {
-                let sets = &standing.best.entry.sets;
-                match other.of(sets, self.constant).0 {
+                let entry = standing.best.entry;
+                match entry.value(other, self.constant).0 {
                     of if of.is_finite() => {
-                        exact(of, other.published(sets, self.constant, self.noise))
+                        exact(of, entry.published(other, self.constant, self.noise))
                     }
                     _ => Cell::Empty,
                 }
+            });
+        }
+        if self.challenge.data.scene.is_some() {
+            add("density", "rows/arcmin²", Cell::Empty, &|standing| {
+                let scenes = &standing.best.info().scenes;
+                let density = |own: &SceneScore| Cell::number(own.density, 1);
+                scenes.as_ref().map_or(Cell::Empty, density)
             });
         }
         let received = info(|info| info.received.strftime("%Y-%m-%d %H:%M").to_string());
@@ -161,6 +170,7 @@ impl View<'_> {
             add("board", "board", Cell::Empty, &|standing| {
                 Cell::text(match standing.board {
                     Board::Main => "main".to_owned(),
+                    Board::Biased => biased(self.challenge.rules.max_m),
                     Board::Late => "late".to_owned(),
                     Board::Partial => format!("{} of {all} sets", standing.best.entry.sets.len()),
                 })
@@ -269,7 +279,7 @@ impl View<'_> {
         } = self.challenge;
         let blocks = vec![Block::Filtered(self.shown_of(&[Board::Main]))];
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
-        if self.detail {
+        if self.detail && data.scene.is_none() {
             sections.push(self.every_set()?);
         }
         let of_board = |board, title: &str| Table {
@@ -278,6 +288,13 @@ impl View<'_> {
             ..self.shown_of(&[board])
         };
         for (id, table) in [
+            (
+                "biased",
+                of_board(
+                    Board::Biased,
+                    &format!("Entries with {}", biased(terms.max_m)),
+                ),
+            ),
             ("late", of_board(Board::Late, "Late entries")),
             ("partial", of_board(Board::Partial, "Entries of some sets")),
             ("failures", self.failures()),
@@ -295,13 +312,16 @@ impl View<'_> {
             let text = Block::Text(paragraphs.join("\n\n"));
             sections.push(Section::new(id, title, vec![text]));
         }
-        let about_data = format!(
-            "{} sets of {} images with {2} × {2} galaxies, {3}",
-            data.sets.len(),
-            data.images,
-            data.grid,
-            volume(data)
-        );
+        let about_data = match &data.scene {
+            Some(scene) => in_words(data, scene),
+            None => format!(
+                "{} sets of {} images with {2} × {2} galaxies, {3}",
+                data.sets.len(),
+                data.images,
+                data.grid,
+                volume(data)
+            ),
+        };
         let settings = [
             ("Version of the data", version.to_string()),
             ("Kind", kind.title().to_owned()),
@@ -362,10 +382,28 @@ impl View<'_> {
     }
 }
 
+// Why entries of scenes have no rank.
+fn biased(max_m: Option<f64>) -> String {
+    format!("|m| above {}", max_m.unwrap_or(f64::INFINITY))
+}
+
+// Scenes with their pixels and area, in words.
+fn in_words(data: &Data, scene: &SceneData) -> String {
+    format!(
+        "{} scenes of {1} × {1} pixels and {2:.2} arcmin² each",
+        data.sets.len(),
+        scene.side,
+        scene.arcmin2
+    )
+}
+
 // Rules of a challenge, one paragraph each.
 fn rules(challenge: &Challenge) -> Vec<String> {
-    let Challenge { kind, rules, .. } = challenge;
+    let Challenge {
+        kind, rules, data, ..
+    } = challenge;
     let covers = match rules.partial {
+        _ if data.scene.is_some() => "An entry has one catalogue of each scene.",
         false => "An entry covers all images of all sets.",
         true => {
             "An entry covers all images of its sets. One of some sets only is listed without a rank."
@@ -373,10 +411,21 @@ fn rules(challenge: &Challenge) -> Vec<String> {
     };
     let mut all = vec![covers.to_owned(), kind.rule().to_owned()];
     all.push(format!(
-        "Entries are ranked by {}, over all sets. {}",
+        "Entries are ranked by {}, over all {}. {}",
         rules.metric.label(),
+        if data.scene.is_some() {
+            "scenes"
+        } else {
+            "sets"
+        },
         rules.metric.meaning()
     ));
+    if let (Some(max_m), Some(scene)) = (rules.max_m, &data.scene) {
+        let error = expected_m_error(data.sets.len() as f64 * scene.arcmin2);
+        all.push(format!(
+            "Entries whose |m|, the mean of both components, is above {max_m} by more than twice its error are listed without a rank. With all scenes, m has an error of about {error:.2}."
+        ));
+    }
     all.push("The response of an entry to the shear must be at least 3σ from zero.".into());
     all.push("Entries whose difference is below its error share a rank. Values are rounded to their errors.".into());
     all.push("Symbolic links are not accepted.".into());
@@ -419,14 +468,22 @@ fn take_part(challenge: &Challenge) -> Vec<String> {
             place(contact, "to the organiser")
         ),
         format!(
-            "Any program may measure the shapes. shearq ({}) measures, packs an entry, and checks it without the true shear: README.md beside the images has the commands.",
-            env!("CARGO_PKG_REPOSITORY")
+            "Any program may measure the shapes. shearq ({}) {}, and checks it without the true shear: README.md beside the images has the commands.",
+            env!("CARGO_PKG_REPOSITORY"),
+            match data.scene {
+                Some(_) => "detects and measures galaxies, which are an entry as they are",
+                None => "measures, packs an entry",
+            }
         ),
     ]
 }
 
-// Bytes of the pixels of all galaxies, in words.
+// Bytes of the pixels of all images, in words.
 fn volume(data: &Data) -> String {
+    if let Some(SceneData { side, .. }) = data.scene {
+        let bytes = data.sets.len() * side * side * size_of::<f32>();
+        return format!("{:.0} MB of exposures, and their PSF", bytes as f64 / 1e6);
+    }
     let pixels = data.galaxies() as f64 * (data.stamp * data.stamp) as f64;
     let megabytes = pixels * size_of::<f32>() as f64 / 1e6;
     match megabytes < 1000.0 {
@@ -435,16 +492,54 @@ fn volume(data: &Data) -> String {
     }
 }
 
-// The page for participants, as Markdown.
-pub(crate) fn readme(challenge: &Challenge) -> String {
+// Data, conventions and entries of a challenge of scenes, as Markdown.
+fn scene_sections(challenge: &Challenge, scene: &SceneData) -> String {
+    let data = &challenge.data;
+    format!(
+        r"## Data
+
+* {about}: `scene-001.fits` and so on, with the sky subtracted and white noise of one per pixel. Galaxies lie anywhere and blend.
+* `psf.fits`: the PSF of all scenes, as a star without noise.
+* Verify the download with `sha256sum -c SHA256SUMS`.
+
+## Conventions
+
+{conventions}
+## Entries
+
+Detect, measure and select with any program. An entry has a catalogue of each scene in CSV, FITS or Parquet, with the number of the scene in the name of the file (`scene-001.csv`) or of its folder. Of sheared catalogues, names or a column state noshear, 1p, 1m, 2p and 2m.
+
+A catalogue has any number of rows with the ellipticities e1 and e2, and perhaps responses (R11, R22, R12, R21), a weight and a flag; positions are not needed. The mean shear of catalogues is Σ w e/Σ w R.
+
+Put all catalogues into one folder, and this folder into a `.tar.gz` or `.zip`. With the detection of shearq:
+
+```sh
+for n in $(seq {count}); do
+  shearq detect --exposure scene-$(printf %03d $n).fits --psf psf.fits --image $n --out ../detected
+done
+tar czf ../entry.tar.gz -C ../detected set01
+shearq challenge check ../entry.tar.gz --challenge .
+```
+
+The last command prints which column is used as what. It finds missing scenes and numbers that are not finite, but neither wrong signs nor exchanged components, for which it would need the true shear.
+
+",
+        about = in_words(data, scene),
+        conventions = in_lines(challenge),
+        count = data.sets.len(),
+    )
+}
+
+fn in_lines(challenge: &Challenge) -> String {
+    let each = challenge.conventions.iter();
+    each.map(|(name, meaning)| format!("* {name}: {meaning}.\n"))
+        .collect()
+}
+
+// Data, conventions and entries of a challenge of galaxies on a grid, as Markdown.
+fn grid_sections(challenge: &Challenge) -> String {
     let Challenge {
-        name,
-        version,
-        kind,
-        data,
-        conventions,
-        rules,
-        ..
+        name, data, rules, ..
     } = challenge;
     let sets: Vec<String> = data.sets.iter().map(u32::to_string).collect();
     let first = data.sets.first().copied().unwrap_or(1);
@@ -460,22 +555,14 @@ pub(crate) fn readme(challenge: &Challenge) -> String {
     };
     let half = 0.5 * (data.stamp as f64 + 1.0);
     let mut text = format!(
-        "# {name}\n\nVersion {version}. Kind: {} (`{}`).\n\nMeasure the shapes of the galaxies. The true shear is secret. `challenge.toml` has the numbers below in machine-readable form.\n\n## Data\n\n",
-        kind.title(),
-        kind.name()
-    );
-    text.push_str(&format!(
-        "* Sets: {}.\n* Images per set: {}, numbered from 1.\n* Galaxies per image: {2} × {2}, in stamps of {3} × {3} pixels.\n* Side of the field: {4} degrees.\n* `layout.toml` has the names of images and PSFs.\n* Verify the download with `sha256sum -c SHA256SUMS`.\n\n",
+        "## Data\n\n* Sets: {}.\n* Images per set: {}, numbered from 1.\n* Galaxies per image: {2} × {2}, in stamps of {3} × {3} pixels.\n* Side of the field: {4} degrees.\n* `layout.toml` has the names of images and PSFs.\n* Verify the download with `sha256sum -c SHA256SUMS`.\n\n",
         sets.join(", "),
         data.images,
         data.grid,
         data.stamp,
         data.field_degrees
-    ));
-    text.push_str("## Conventions\n\n");
-    for (name, meaning) in conventions {
-        text.push_str(&format!("* {name}: {meaning}.\n"));
-    }
+    );
+    text.push_str(&format!("## Conventions\n\n{}", in_lines(challenge)));
     text.push_str(&format!(
         "\n## Entries\n\nAn ellipticity catalogue is an ASCII file `{}` per image with one line per galaxy: `x y e1 e2`. For example, the first galaxy:\n\n```text\n{half} {half} 0.0312 -0.0147\n```\n\n",
         catalogue.file_name()
@@ -487,9 +574,29 @@ pub(crate) fn readme(challenge: &Challenge) -> String {
         ));
     }
     text.push_str(&format!(
-        "Put the files of an entry into one `.tar.gz` or `.zip`. shearq does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
+        "Put the files of an entry into one `.tar.gz` or `.zip`. shearq does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n",
         name.replace(['"', '\\', '$', '`'], "")
     ));
+    text
+}
+
+// The page for participants, as Markdown.
+pub(crate) fn readme(challenge: &Challenge) -> String {
+    let Challenge {
+        name,
+        version,
+        kind,
+        ..
+    } = challenge;
+    let (task, sections) = match &challenge.data.scene {
+        Some(scene) => ("shear of each scene", scene_sections(challenge, scene)),
+        None => ("shapes of the galaxies", grid_sections(challenge)),
+    };
+    let mut text = format!(
+        "# {name}\n\nVersion {version}. Kind: {} (`{}`).\n\nMeasure the {task}. The true shear is secret. `challenge.toml` has the numbers below in machine-readable form.\n\n{sections}## Rules\n\n",
+        kind.title(),
+        kind.name()
+    );
     for rule in self::rules(challenge) {
         text.push_str(&format!("* {rule}\n"));
     }

@@ -47,6 +47,9 @@ pub struct Standing<'a> {
 pub enum Board {
     /// Entries in time that cover all sets, and references.
     Main,
+    /// Entries of scenes whose |m| is above the limit of the challenge. They have no rank, because a cut or a weight that biases m
+    /// may lower the shear error.
+    Biased,
     /// Entries after the deadline. The truth may have become known.
     Late,
     /// Entries of some sets. They have no rank, because some sets are easier than others and means over them do not compare.
@@ -55,7 +58,7 @@ pub enum Board {
 
 impl Board {
     /// In the order of the page.
-    pub const ALL: [Board; 3] = [Board::Main, Board::Late, Board::Partial];
+    pub const ALL: [Board; 4] = [Board::Main, Board::Biased, Board::Late, Board::Partial];
 }
 
 #[derive(Debug, Default)]
@@ -97,13 +100,13 @@ pub fn rank<'a>(
     let mut compared: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
-        let (value, error) = metric.of(&entry.sets, constant);
+        let (value, error) = entry.value(metric, constant);
         let mut result = Scored {
             entry,
             number: 1,
             value,
             error,
-            published: metric.published(&entry.sets, constant, noise),
+            published: entry.published(metric, constant, noise),
         };
         if info.reference && info.scored && entry.withdrawn.is_none() {
             // Each reference has a line.
@@ -125,8 +128,12 @@ pub fn rank<'a>(
             (None, None) if !info.scored => UNSCORED.into(),
             (None, None) => {
                 let late = |closes: &Deadline| info.received > closes.last;
+                let max_m = rules.max_m.unwrap_or(f64::INFINITY);
                 let board = match rules.closes.as_ref().is_some_and(late) {
-                    _ if entry.sets.len() < challenge.data.sets.len() => Board::Partial,
+                    _ if info.scenes.is_some_and(|own| own.is_biased(max_m)) => Board::Biased,
+                    _ if info.scenes.is_none() && entry.sets.len() < challenge.data.sets.len() => {
+                        Board::Partial
+                    }
                     true => Board::Late,
                     false => Board::Main,
                 };
@@ -154,7 +161,7 @@ fn standings<'a>(teams: Teams<'a>, metric: RankBy) -> Vec<Standing<'a>> {
             )?;
         Some(Standing {
             board,
-            rank: (!reference && board != Board::Partial).then_some(0),
+            rank: (!reference && matches!(board, Board::Main | Board::Late)).then_some(0),
             best: best.clone(),
             shared: false,
             same_as: None,
@@ -414,6 +421,7 @@ pub(crate) mod tests {
                 reference: team.starts_with("our"),
                 scored: true,
                 findings: Vec::new(),
+                scenes: None,
             },
             sets: vec![record(2, q, replicates)],
             withdrawn: None,
@@ -435,6 +443,7 @@ pub(crate) mod tests {
                 grid: 8,
                 stamp: 48,
                 field_degrees: 10.0,
+                scene: None,
             },
             conventions: BTreeMap::new(),
             rules: Rules {
@@ -444,6 +453,7 @@ pub(crate) mod tests {
                 opens: None,
                 closes: "2026-11-30".parse().ok(),
                 partial: true,
+                max_m: None,
             },
         }
     }

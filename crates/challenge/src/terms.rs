@@ -46,9 +46,28 @@ pub struct Data {
     pub sets: Vec<u32>,
     /// Images of each set, numbered from 1.
     pub images: u32,
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub grid: usize,
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub stamp: usize,
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub field_degrees: f64,
+    /// Exposures instead of galaxies on a grid: each is a set of one image.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene: Option<SceneData>,
+}
+
+fn is_zero<T: Default + PartialEq>(number: &T) -> bool {
+    *number == T::default()
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneData {
+    /// Pixels a side.
+    pub side: usize,
+    /// The area that has objects.
+    pub arcmin2: f64,
 }
 
 impl Data {
@@ -56,14 +75,21 @@ impl Data {
         self.sets.len() as u64 * u64::from(self.images)
     }
 
+    /// Galaxies of all images, or the number of scenes, in which nobody knows theirs.
     pub fn galaxies(&self) -> u64 {
+        if self.scene.is_some() {
+            return self.files();
+        }
         self.files()
             .saturating_mul((self.grid as u64).saturating_pow(2))
     }
 
     /// Bytes of the largest valid entry, unpacked.
     pub fn largest_entry(&self) -> u64 {
-        let rows = self.galaxies().saturating_mul(BYTES_PER_ROW);
+        let rows = match self.scene {
+            Some(SceneData { side, .. }) => self.files() * BYTES_PER_PIXEL * (side * side) as u64,
+            None => self.galaxies().saturating_mul(BYTES_PER_ROW),
+        };
         (FREE_BYTES + self.files() * BYTES_PER_FILE).saturating_add(rows)
     }
 
@@ -78,6 +104,8 @@ impl Data {
 
 // Four numbers of 24 characters, which is the longest that a 64-bit number has, and four separators, rounded up.
 const BYTES_PER_ROW: u64 = 128;
+// Of catalogues of scenes: twice the exposures, so that five sheared catalogues with many columns fit. Chosen by hand.
+const BYTES_PER_PIXEL: u64 = 8;
 // A header, its line in the manifest, and what tar adds; a spectrum with its covariances. Chosen by hand.
 const BYTES_PER_FILE: u64 = 1 << 12;
 // Licences and notes beside the files. Chosen by hand.
@@ -97,6 +125,9 @@ pub struct Rules {
     /// Whether entries may cover some sets only. They have no rank.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub partial: bool,
+    /// Largest |m| of ranked entries of scenes, to which twice its error is added.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_m: Option<f64>,
 }
 
 /// Entries that determine m and c of both components: one, and a shift and a stretch of each (crates/challenge/tests/extraction.rs).
@@ -203,9 +234,19 @@ impl Challenge {
                 ));
             }
         }
-        self.data
-            .grid()
-            .map_err(|error| format!("`data`: {error}"))?;
+        match self.data.scene {
+            None => {
+                let grid = self.data.grid();
+                grid.map_err(|error| format!("`data`: {error}"))?;
+            }
+            Some(SceneData { side, arcmin2 }) => {
+                if side == 0 || arcmin2.is_nan() || arcmin2 <= 0.0 {
+                    return Err(format!(
+                        "`data.scene`: found {side} pixels a side and {arcmin2} arcmin², expected positive numbers"
+                    ));
+                }
+            }
+        }
         check_name(&self.name).map_err(|error| error.to_string())
     }
 
