@@ -102,6 +102,10 @@ mod tests {
         assert!((line.intercept - 3.0 / 14.0).abs() < 1e-15);
         let residuals = 14.0 - 169.0 / 14.0;
         assert!((line.slope_error() - (residuals / 2.0 / 14.0_f64).sqrt()).abs() < 1e-15);
+        // The same without degrees of freedom, and at x = 0 of the mean 3.
+        let [intercept, slope] = line.errors_of_great3();
+        assert!((slope - (residuals / 4.0 / 14.0_f64).sqrt()).abs() < 1e-15);
+        assert!((intercept - slope * (14.0 / 4.0 + 9.0_f64).sqrt()).abs() < 1e-15);
         assert!((line.correlation() - 13.0 / 14.0).abs() < 1e-15);
         assert!((line.derivatives(6.0)[1] - 3.0 / 14.0).abs() < 1e-15);
     }

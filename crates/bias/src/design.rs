@@ -562,6 +562,23 @@ mod tests {
     }
 
     #[test]
+    fn a_part_that_states_another_one_keeps_its_values() {
+        let all: Vec<(String, [f64; 2])> = (0..8)
+            .map(|k| {
+                let (arm, tile) = (k / 4, k % 4);
+                let name = format!("{}/run{}/tile{tile}.fits", ["p", "q"][arm], tile / 2);
+                (name, [[0.02, 0.0], [-0.02, 0.0]][arm])
+            })
+            .collect();
+        let all: Vec<_> = all.iter().map(|(name, g)| (name.as_str(), *g)).collect();
+        // A tile states its run, which does not state the tile.
+        assert_eq!(
+            names::groups(&named(&all)),
+            Some(vec![0, 1, 2, 3, 0, 1, 2, 3])
+        );
+    }
+
+    #[test]
     fn versions_of_the_same_galaxies_belong_to_a_group() {
         let groups = |shears: &[[f64; 2]], name: &dyn Fn(usize, usize, usize) -> String| {
             let mut all = Vec::new();

@@ -138,3 +138,14 @@ fn parts(name: &str) -> Vec<&str> {
     }
     parts
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_determined_by_finer_ones() {
+        let (coarse, fine) = ([0, 0, 1, 1], [5, 6, 7, 7]);
+        assert!(determines(&fine, &coarse) && !determines(&coarse, &fine));
+    }
+}

@@ -232,6 +232,29 @@ fn rows_that_do_not_correspond_are_noticed() {
 }
 
 #[test]
+fn a_catalogue_of_each_shear_makes_a_set() {
+    let shears = [[0.02, 0.0], [-0.02, 0.0], [0.0, 0.02], [0.0, -0.02]];
+    let grouped = |versions: usize| {
+        let mut sums = UnitSums::new(Layout::default(), 1, 24 * 4 * versions);
+        let mut catalogues = Vec::new();
+        for (tile, version) in (0..24).flat_map(|tile| (0..versions).map(move |v| (tile, v))) {
+            for g in shears {
+                let at = catalogues.len() as u32;
+                let name = format!("g{}{}/v{version}/tile{tile}.fits", g[0], g[1]);
+                catalogues.push(catalogue(&name, 1, g));
+                sums.add(at, 0, 0, &row([0.1 * f64::from(at % 7), 0.1], 1.0, g));
+            }
+        }
+        group(sums, &catalogues, Design::Arms, None, false).unit
+    };
+    assert_eq!(
+        grouped(1),
+        "sets of catalogues with one catalogue per shear"
+    );
+    assert_eq!(grouped(2), "sets of catalogues of the same galaxies");
+}
+
+#[test]
 fn without_names_the_assumption_is_stated() {
     let sums = |count: u32| {
         let mut sums = UnitSums::new(Layout::default(), 1, count as usize);

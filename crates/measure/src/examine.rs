@@ -36,6 +36,7 @@ const BANDING_ACROSS: f64 = 0.33;
 // 20, columns of 0.2 σ: alternate ones c1 = +0.0037 and m = −0.0035, two and two +0.0058 and −0.0153, random ones −0.0069 and −0.0025. The
 // squared scatter that is found is 4/3 as large for waves. Rows have c1 of the other sign; at S/N 40, all are a quarter.
 const C1_BY_LEVELS: [f64; 3] = [0.078, 0.123, -0.17];
+// m of the same.
 const M_BY_LEVELS: [f64; 3] = [-0.066, -0.285, -0.05];
 // By which c1 of waves falls behind the square: +0.0105 for alternate columns of 0.5 σ, +0.027 for 1 σ. The same galaxies.
 const C1_DAMPING: f64 = 3.0;

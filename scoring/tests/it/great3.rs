@@ -9,7 +9,7 @@ use shearq_quantities::Shear;
 use shearq_quantities::units::Degrees;
 use shearq_scoring::aperture::{Correlations, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    ConstantField, Observation, along, constant_score, position_angle, variable_score,
+    ConstantField, Identity, Observation, along, constant_score, position_angle, variable_score,
 };
 use shearq_scoring::great08;
 use shearq_scoring::{Grid, ScoringError};
@@ -228,4 +228,11 @@ fn impossible_input_is_an_error() {
     assert!(variable_score(&[[0.0; 15]], &[], Observation::Space).is_err());
     assert!(great08::score(&[]).is_err() && great08::score(&[vec![]]).is_err());
     assert!((separations()[3].0 - 0.0853).abs() < 5e-5);
+}
+
+#[test]
+fn identities_state_subfield_column_and_row() {
+    let identity = Identity::new(12, (34, 56));
+    assert_eq!(identity.to_string(), "012034056");
+    assert_eq!((identity.subfield(), identity.place()), (12, (34, 56)));
 }
