@@ -12,7 +12,7 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::Detector;
 use shearq_quantities::linear::Matrix2;
 use shearq_quantities::statistics::upper_median;
-use shearq_quantities::{Frame, Jacobian};
+use shearq_quantities::{Frame, Jacobian, tried};
 
 use super::exposure::Exposure;
 use super::files::{Content, Files, Images};
@@ -296,7 +296,7 @@ impl PixelSize {
         let stated = self.oversampling.filter(|stated| *stated != 1.0)?;
         let is_unused =
             self.scale.and(galaxies).is_none() && self.oversampling_of(galaxies).is_none();
-        is_unused.then(|| format!("the header states {stated:.3} pixels of the PSF along a pixel of the galaxies (found OVERSAMP, PSF_SAMP or SAMPLING, expected a whole number of 1 to {MAX_OVERSAMPLING}), which is not used. A PSF of other pixels biases m by 1.3 times the relative difference or more. Try: resample the PSF to the pixels of the galaxies"))
+        is_unused.then(|| format!("the header states {stated:.3} pixels of the PSF along a pixel of the galaxies (found OVERSAMP, PSF_SAMP or SAMPLING, expected a whole number of 1 to {MAX_OVERSAMPLING}), which is not used. A PSF of other pixels biases m by 1.3 times the relative difference or more{}", tried(Some("resample the PSF to the pixels of the galaxies"))))
     }
 
     /// The pixels of PSFs along a pixel of galaxies of this scale, unless the scales contradict it.
