@@ -322,7 +322,7 @@ def measure_blocks(
             pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
             local = None if wcs is None else wcs[0] if len(wcs) == 1 else wcs[start:end]
             try:
-                image = _image(pixels, one, level, missing, local, *columns[1:], detector)
+                image = _image(pixels, one, level, missing, local, columns[1], columns[2], detector)
                 yield _measure([image], tuple(columns), settings, count, done)
             except ValueError as error:
                 raise ValueError(f"{error} (stamps {start} to {end - 1})") from None
