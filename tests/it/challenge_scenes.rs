@@ -153,6 +153,19 @@ fn catalogues_of_an_entry_are_checked() {
         String::from_utf8(output.stdout).unwrap()
     };
     folder.said("challenge check inbox/A --challenge public");
+    // A line passes through two scenes whatever their shears are.
+    for (scene, weight) in [(1, "1e-9"), (2, "1"), (3, "1")] {
+        let path = format!("inbox/A/scene-{scene:03}/shapes.csv");
+        let own = fs::read_to_string(folder.at(&path)).unwrap();
+        let weighted = own.trim_end().replace('\n', &format!(",{weight}\n"));
+        let weighted = weighted.replacen(&format!(",{weight}"), ",w", 1);
+        folder.write(&path, format!("{weighted},{weight}\n"));
+    }
+    let few = "few scenes decide: the mean shear follows as if from 2.0 of 3";
+    assert_has(&check(), few);
+    let rank = "challenge rank inbox --challenge public --truth public-truth --store store";
+    assert_has(&folder.said(rank), few);
+    entry(&folder, "A", 100, 1.0);
     let first = "inbox/A/scene-001/shapes.csv";
     let content = fs::read_to_string(folder.at(first)).unwrap();
     folder.write(first, content.clone() + "nan,0.1\n");
@@ -170,7 +183,6 @@ fn catalogues_of_an_entry_are_checked() {
     );
     folder.remove("inbox/A/scene-004.csv");
     // Faults of the form do not count as entries, and are told in full.
-    let rank = "challenge rank inbox --challenge public --truth public-truth --store store";
     assert_has(&folder.said(rank), "scene 1 has no catalogue");
     // Sheared catalogues.
     folder.remove("inbox/A");

@@ -136,6 +136,14 @@ impl Layout {
         }
     }
 
+    /// Of `sums`, what divides the ellipticities of both components: weights times responses, or weights alone if sheared catalogues
+    /// contain the response.
+    pub(crate) fn divisors(self, sums: &[f64]) -> [f64; 2] {
+        let n = self.terms();
+        let weights = if self.sheared { triangle(n) } else { 0 };
+        [0, 1].map(|k| sums[HEAD + k * self.of_component() + n + weights])
+    }
+
     /// Never: there is always a count.
     pub fn is_empty(self) -> bool {
         false

@@ -65,6 +65,26 @@ impl UnitSums {
         self.bins
     }
 
+    /// How many catalogues of equal weight would determine the mean shear as well: (Σ W)²/Σ W², where W is what a catalogue's
+    /// ellipticities are divided by. The smaller one of both components.
+    pub fn effective_catalogues(&self) -> f64 {
+        let mut each: BTreeMap<u32, [f64; 2]> = BTreeMap::new();
+        for ((catalogue, _), sums) in &self.units {
+            let own = each.entry(*catalogue).or_default();
+            for sums in sums.chunks_exact(self.layout.len()) {
+                let [first, second] = self.layout.divisors(sums);
+                *own = [own[0] + first, own[1] + second];
+            }
+        }
+        let effective = |k: usize| {
+            let (sum, squares) = each.values().fold((0.0, 0.0), |(sum, squares), own| {
+                (sum + own[k], squares + own[k] * own[k])
+            });
+            sum * sum / squares
+        };
+        effective(0).min(effective(1))
+    }
+
     /// Adds a galaxy to the unit `key` of the `catalogue` of this number, in a bin from 0.
     ///
     /// # Panics

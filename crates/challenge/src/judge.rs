@@ -604,7 +604,10 @@ impl Judge {
     ) -> Result<Verdict, String> {
         let shears = self.constant.as_ref();
         let shear = |scene| shears.map_or([f64::NAN; 2], |all| all.of_set(scene));
-        let summed = scenes::summed(sent, &self.challenge.data.sets, shear)
+        let sets = &self.challenge.data.sets;
+        // What is wrong without the truth is told in full, and does not count.
+        let summed = scenes::check(sent, sets)
+            .and_then(|_| scenes::summed(sent, sets, shear))
             .map_err(|error| scenes::shortened(&error.to_string(), sent))?;
         let mut verdict = Verdict::default();
         match SceneScore::new(&summed, scene.arcmin2) {

@@ -110,7 +110,13 @@ pub enum SceneError {
         found: usize,
         expected: usize,
     },
+    #[error("few scenes decide: the mean shear follows as if from {effective:.1} of {scenes} (expected {:.0} or more, of weights times responses in each scene){}", LEAST_EVEN * *scenes as f64, tried(self.hint()))]
+    Uneven { effective: f64, scenes: usize },
 }
+
+// Least number of scenes of equal weight that determine the mean shear as well as those of an entry, in units of all. Poisson noise of 180
+// galaxies in a scene leaves 0.99. An entry that is of few scenes has a line through them by chance, and no error.
+const LEAST_EVEN: f64 = 0.8;
 
 impl SceneError {
     hints! {
@@ -118,6 +124,7 @@ impl SceneError {
         Self::Bias(error) => return error.hint(),
         Self::Unnamed(..) => "scene-001.csv, or any name in a folder scene-001",
         Self::Missing { .. } => "a catalogue of each scene, such as scene-001.csv",
+        Self::Uneven { .. } => "all galaxies of each scene, and weights that do not depend on the scene",
     }
 }
 
@@ -219,7 +226,13 @@ pub fn summed(
         design: Some(Design::Fields),
         ..Request::default()
     };
-    Ok(sum(&request, &|_| true)?)
+    let summed = sum(&request, &|_| true)?;
+    let (effective, scenes) = (summed.effective_catalogues(), scenes.len());
+    // Not a number fails, too.
+    match effective >= LEAST_EVEN * scenes as f64 {
+        true => Ok(summed),
+        false => Err(SceneError::Uneven { effective, scenes }),
+    }
 }
 
 /// What is known of an entry without the true shears: which column is used as what, a line each, and what is probably wrong.

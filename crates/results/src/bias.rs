@@ -732,6 +732,11 @@ impl Summed {
         [all].into_iter().chain(bins).collect()
     }
 
+    /// See [`UnitSums::effective_catalogues`].
+    pub fn effective_catalogues(&self) -> f64 {
+        self.sums.effective_catalogues()
+    }
+
     pub fn about(&self) -> &About {
         &self.about
     }
