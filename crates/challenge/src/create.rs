@@ -270,6 +270,7 @@ pub fn of_scenes(
         scene: Some(SceneData {
             side: settings.side,
             arcmin2: settings.area_arcmin2(),
+            psf_varies: settings.psf_gradient != [0.0; 2],
         }),
     };
     // The noise of the images is in the scatter that ranks entries, so that no error is smaller.

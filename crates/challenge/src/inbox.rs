@@ -95,7 +95,9 @@ impl Found {
         }
         let mut inside = list(folder)?;
         inside.sort();
-        if of_scenes && scenes::is_entry(&inside) {
+        // An inbox is none, because the names of others in it state a scene.
+        let is_own = depth > 0 || scenes::is_mostly_scenes(&inside);
+        if of_scenes && is_own && scenes::is_entry(&inside) {
             self.add(folder, team, depth);
             return Ok(());
         }

@@ -495,11 +495,21 @@ fn volume(data: &Data) -> String {
 // Data, conventions and entries of a challenge of scenes, as Markdown.
 fn scene_sections(challenge: &Challenge, scene: &SceneData) -> String {
     let data = &challenge.data;
+    let (psf, model) = match scene.psf_varies {
+        false => (
+            "`psf.fits`: the PSF of all scenes, as a star without noise",
+            "psf.fits",
+        ),
+        true => (
+            "`model.psf`: the PSF at each place of all scenes, as PSFEx has it; `psf.fits`: that of the middle, as a star without noise",
+            "model.psf",
+        ),
+    };
     format!(
         r"## Data
 
 * {about}: `scene-001.fits` and so on, with the sky subtracted and white noise of one per pixel. Galaxies lie anywhere and blend.
-* `psf.fits`: the PSF of all scenes, as a star without noise.
+* {psf}.
 * Verify the download with `sha256sum -c SHA256SUMS`.
 
 ## Conventions
@@ -507,7 +517,7 @@ fn scene_sections(challenge: &Challenge, scene: &SceneData) -> String {
 {conventions}
 ## Entries
 
-Detect, measure and select with any program. An entry has a catalogue of each scene in CSV, FITS or Parquet, with the number of the scene in the name of the file (`scene-001.csv`) or of its folder. Of sheared catalogues, names or a column state noshear, 1p, 1m, 2p and 2m.
+Detect, measure and select with any program. An entry has a catalogue of each scene in CSV, FITS or Parquet, with the number of the scene in the name of the file (`scene-001.csv`). Of sheared catalogues, names or a column state noshear, 1p, 1m, 2p and 2m.
 
 A catalogue has any number of rows with the ellipticities e1 and e2, and perhaps responses (R11, R22, R12, R21), a weight and a flag; positions are not needed. The mean shear of catalogues is Σ w e/Σ w R.
 
@@ -515,7 +525,7 @@ Put all catalogues into one folder, and this folder into a `.tar.gz` or `.zip`. 
 
 ```sh
 for n in $(seq {count}); do
-  shearq detect --exposure scene-$(printf %03d $n).fits --psf psf.fits --image $n --out ../detected
+  shearq detect --exposure scene-$(printf %03d $n).fits --psf {model} --image $n --out ../detected
 done
 tar czf ../entry.tar.gz -C ../detected set01
 shearq challenge check ../entry.tar.gz --challenge .

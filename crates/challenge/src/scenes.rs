@@ -17,6 +17,7 @@ use shearq_files::{FileError, names_of};
 use shearq_pipeline::scenes::SHEARS;
 use shearq_quantities::{hints, tried};
 use shearq_results::bias::{BiasFailure, Summed, sum};
+use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::{MANIFEST_FILE, Sent};
 use shearq_results::views::per_area::shear_error;
 use thiserror::Error;
@@ -146,15 +147,21 @@ pub fn scene_of(name: &Path) -> Option<u32> {
     BEFORE_NUMBER.iter().find_map(after)
 }
 
+// Whether the name of a file or folder is that of a part of an entry.
+fn is_part(path: &Path) -> bool {
+    let of_scene = |own| scene_of(Path::new(own)).is_some();
+    path.ends_with(RUN_FILE) || (path.file_name().is_some_and(of_scene) && !is_archive(path))
+}
+
 /// Whether a folder is an entry: `detect` wrote it, or the names of what it contains state scenes.
 pub fn is_entry(inside: &[PathBuf]) -> bool {
-    let named = |path: &PathBuf| {
-        path.ends_with(RUN_FILE)
-            || path
-                .file_name()
-                .is_some_and(|own| scene_of(Path::new(own)).is_some())
-    };
-    inside.iter().any(named)
+    inside.iter().any(|path| is_part(path))
+}
+
+/// Whether most of what a folder contains are parts of one entry.
+pub fn is_mostly_scenes(inside: &[PathBuf]) -> bool {
+    let is_run = inside.iter().any(|path| path.ends_with(RUN_FILE));
+    is_run || 2 * inside.iter().filter(|path| is_part(path)).count() > inside.len()
 }
 
 /// The catalogues of an entry that is a folder, in order of their paths. They may be in folders, and `detect` writes the record of
@@ -289,6 +296,14 @@ mod tests {
         ] {
             assert_eq!(of(name), None, "{name}");
         }
+    }
+
+    #[test]
+    fn an_inbox_is_no_entry_because_of_one_name() {
+        let of =
+            |names: &[&str]| is_mostly_scenes(&names.iter().map(PathBuf::from).collect::<Vec<_>>());
+        assert!(of(&["scene-001.csv", "scene-002.csv", "notes.txt"]) && of(&[RUN_FILE, "set01"]));
+        assert!(!of(&["scene-1-team.tar.gz"]) && !of(&["honest", "Scene-7"]));
     }
 
     #[test]

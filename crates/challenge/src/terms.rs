@@ -68,6 +68,9 @@ pub struct SceneData {
     pub side: usize,
     /// The area that has objects.
     pub arcmin2: f64,
+    /// Whether the PSF varies over a scene.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub psf_varies: bool,
 }
 
 impl Data {
@@ -239,7 +242,7 @@ impl Challenge {
                 let grid = self.data.grid();
                 grid.map_err(|error| format!("`data`: {error}"))?;
             }
-            Some(SceneData { side, arcmin2 }) => {
+            Some(SceneData { side, arcmin2, .. }) => {
                 if side == 0 || arcmin2.is_nan() || arcmin2 <= 0.0 {
                     return Err(format!(
                         "`data.scene`: found {side} pixels a side and {arcmin2} arcmin², expected positive numbers"

@@ -398,6 +398,7 @@ const M_BY_GIVEN_VARIANCE: f64 = 0.077;
 // m times the S/N and the noise of a pixel in electrons: docs/survey.md, S/N 30 over 100 and 10 electrons of sky, +0.004 and +0.013.
 const M_BY_POISSON_NOISE: f64 = 1.2;
 // Least m that is stated: what Euclid requires.
+const MIN_ELECTRONS: f64 = 2.0; // Of noise per pixel: detectors read with more, so that below it the gain is not that of the pixels.
 const MIN_POISSON_M: f64 = 0.002;
 // The column `snr` in units of the S/N: docs/limitations.md.
 const SNR_COLUMN: f64 = 0.74;
@@ -545,12 +546,14 @@ impl Warning {
         let snr = upper_median(&mut snr)? / SNR_COLUMN;
         let electrons = gain * upper_median(&mut noise)?;
         let m = M_BY_POISSON_NOISE / (snr * electrons);
-        (m > MIN_POISSON_M && m.is_finite()).then_some(Warning::PoissonNoise {
-            gain,
-            electrons,
-            snr,
-            m,
-        })
+        (m > MIN_POISSON_M && m.is_finite() && electrons > MIN_ELECTRONS).then_some(
+            Warning::PoissonNoise {
+                gain,
+                electrons,
+                snr,
+                m,
+            },
+        )
     }
 
     fn of_defects(galaxies: &[Measurement]) -> Option<Warning> {

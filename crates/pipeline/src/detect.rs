@@ -358,6 +358,9 @@ impl DetectionTask<'_> {
             return Err(exposure.origin.fault(&fault).into());
         }
         let jacobian = self.jacobian(&wcs, sides, &exposure)?;
+        if let Some(fault) = wcs.fault().filter(|_| jacobian.is_some()) {
+            return Err(exposure.origin.fault(&fault).hint("--frame pixel").into());
+        }
         let sample = sample(&mut exposure, sides)?;
         let level = self.noise(&mut exposure, &sample)?;
         let axes = (&wcs, jacobian.as_ref());
@@ -397,6 +400,7 @@ impl DetectionTask<'_> {
         });
         let mut doubts = doubts(cells.stars(), sky, sigma, level.measured);
         doubts.extend(of_model);
+        doubts.extend(wcs.doubts().iter().cloned());
         doubts.extend(unlit_in_words(unlit));
         Ok(Detected {
             detections: found.len(),
@@ -576,7 +580,14 @@ impl DetectionTask<'_> {
             )
             .hint("a model of PSFEx or Piff, if the PSF varies"));
         }
-        if let Some(warning) = Wcs::disagreements(&planes.wcs()?, wcs).next() {
+        let of_psf = planes.wcs()?;
+        if let Some(fine) = of_psf.oversampling().filter(|fine| *fine != 1.0) {
+            let message = format!(
+                "the header states {fine} pixels of the PSF along a pixel of the galaxies (expected 1)"
+            );
+            return Err(FileError::new(path, message).hint("resample the PSF"));
+        }
+        if let Some(warning) = Wcs::disagreements(&of_psf, wcs).next() {
             return Err(FileError::new(path, warning));
         }
         Array2::from_shape_vec((height, width), pixels).map_err(|error| FileError::new(path, error))

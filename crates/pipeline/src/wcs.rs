@@ -229,6 +229,62 @@ mod tests {
         );
     }
 
+    fn of_cards(cards: &[(&str, &str)]) -> Wcs {
+        let cards = cards
+            .iter()
+            .map(|(key, value)| ((*key).into(), (*value).into()));
+        Wcs::of_keys(&Keys::new(cards.collect()))
+    }
+
+    #[test]
+    fn steps_units_and_levels_are_those_of_the_pixels() {
+        for (key, value, expected) in [
+            ("PSF_SAMP", "0.5", Some(2.0)),
+            // Pixels of the galaxies per pixel of the PSF, which is coarser.
+            ("PSF_SAMP", "2.0", Some(0.5)),
+            ("SAMPLING", "2", Some(2.0)),
+            ("SAMPLING", "-1", None),
+        ] {
+            assert_eq!(of_cards(&[(key, value)]).oversampling(), expected, "{key}");
+        }
+        for (unit, gain, saturation) in [
+            ("'adu'", Some(1.5), Some(6e4)),
+            ("'nJy'", None, None),
+            ("'electron s-1'", Some(100.0), None),
+            ("'ELECTRONS/S'", Some(100.0), None),
+            ("'MJy/sr'", None, None),
+        ] {
+            let keys = [
+                ("BUNIT", unit),
+                ("GAIN", "1.5"),
+                ("EXPTIME", "100"),
+                ("SATURATE", "60000"),
+            ];
+            let found = of_cards(&keys).detector();
+            assert_eq!((found.gain, found.saturation), (gain, saturation), "{unit}");
+        }
+    }
+
+    #[test]
+    fn plates_whose_pole_is_the_southern_one_are_not_read() {
+        let fault = |more: &[(&str, &str)]| {
+            let mut cards = vec![
+                ("CTYPE1", "'RA---CAR'"),
+                ("CTYPE2", "'DEC--CAR'"),
+                ("CRPIX1", "1"),
+                ("CRPIX2", "1"),
+                ("CRVAL1", "10"),
+                ("CD1_1", "-0.01"),
+                ("CD2_2", "0.01"),
+            ];
+            cards.extend(more);
+            of_cards(&cards).fault()
+        };
+        assert_eq!(fault(&[("CRVAL2", "40")]), None);
+        assert!(fault(&[("CRVAL2", "40"), ("LATPOLE", "0")]).is_some());
+        assert!(fault(&[("CRVAL2", "90")]).is_some());
+    }
+
     // The name of a header, its cards, and places with derivatives.
     type Header = (String, BTreeMap<String, String>, Vec<[f64; 8]>);
 

@@ -228,6 +228,12 @@ impl SceneSettings {
             ),
             format!("{least} to {most} everywhere"),
         )?;
+        // Where the terms of model.psf have errors of 1 % of the peak.
+        expect(
+            of_size.abs() <= 0.2,
+            format!("the FWHM of the PSF changes by {of_size}"),
+            "at most 0.2".into(),
+        )?;
         let [e1, e2] = psf_shape.map(|e| e.abs() + of_shape.abs());
         expect(
             e1.hypot(e2) <= 0.3,

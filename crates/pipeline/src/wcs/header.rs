@@ -16,7 +16,10 @@ const PIXEL_SCALE_KEYS: [&str; 3] = ["PIXSCALE", "GS_SCALE", "PIXELSCL"];
 const OTHER_SCALE_KEYS: [&str; 3] = ["PIXSCAL1", "SECPIX", "PSCALE"];
 // Keys of the pixels of a PSF along one of the galaxies: of STPSF and WebbPSF. PSFEx states the inverse, and programs disagree on SAMPLING.
 const OVERSAMPLING_KEY: &str = "OVERSAMP";
-const STEP_KEYS: [&str; 2] = ["PSF_SAMP", "SAMPLING"];
+const STEP_KEY: &str = "PSF_SAMP";
+const AMBIGUOUS_KEY: &str = "SAMPLING";
+// Ends of units per second.
+const RATES: [&str; 7] = ["/S", "/SEC", "/SECOND", " S-1", ".S-1", " S**-1", " S^-1"];
 // Keys of electrons per ADU.
 const GAIN_KEYS: [&str; 2] = ["GAIN", "EGAIN"];
 // Rounding of the inverse of such a step.
@@ -120,13 +123,13 @@ impl Keys {
     /// Pixels of a PSF along a pixel of the galaxies. Elsewhere the keys may be texts.
     fn oversampling(&self) -> Option<f64> {
         let number = |key: &str| self.values.get(key)?.parse::<f64>().ok();
-        let of_step = |step: f64| match step > 1.0 {
-            true => step,
-            false => 1.0 / step,
+        let of_step = || Some(number(STEP_KEY)?.recip());
+        let of_either = || {
+            let step = number(AMBIGUOUS_KEY)?;
+            Some(step.max(step.recip()))
         };
-        let stated = number(OVERSAMPLING_KEY);
-        let stated = stated.or_else(|| STEP_KEYS.into_iter().find_map(number).map(of_step));
-        let stated = stated.filter(|stated| stated.is_finite())?;
+        let stated = number(OVERSAMPLING_KEY).or_else(of_step).or_else(of_either);
+        let stated = stated.filter(|stated| stated.is_finite() && *stated > 0.0)?;
         let is_rounded = (stated - stated.round()).abs() < MAX_STEP_ROUNDING * stated;
         Some(if is_rounded { stated.round() } else { stated })
     }
@@ -138,15 +141,14 @@ impl Keys {
             (value > 0.0 && value.is_finite()).then_some(value)
         };
         let unit = self.text("BUNIT");
-        let (unit, is_rate) = match unit.split_once('/') {
-            Some((unit, "S" | "SEC" | "SECOND")) => (unit, true),
-            Some(_) => return Detector::default(),
-            None => (unit.as_str(), false),
-        };
-        let gain = match unit.trim() {
+        let unit = unit.trim();
+        let of_rate = RATES.into_iter().find_map(|end| unit.strip_suffix(end));
+        let (unit, is_rate) = (of_rate.unwrap_or(unit).trim(), of_rate.is_some());
+        let gain = match unit {
             "ELECTRON" | "ELECTRONS" | "E" | "E-" => Some(1.0),
             "" | "ADU" | "DN" | "COUNT" | "COUNTS" => GAIN_KEYS.into_iter().find_map(number),
-            _ => None,
+            // Calibrated pixels: the level of saturation is that of the raw ones.
+            _ => return Detector::default(),
         };
         let time = if is_rate {
             number("EXPTIME")
@@ -480,7 +482,8 @@ fn is_upright(keys: &Keys, dec: f64) -> bool {
     let moved = [
         "PV1_1", "PV1_2", "PV1_3", "PV1_4", "PV2_1", "PV2_2", "PV2_3", "PV2_4",
     ];
-    up && of("LATPOLE", 90.0) >= 0.0 && !moved.iter().any(|key| keys.has(key))
+    // Two poles are as near to a LATPOLE of 0, and the southern one is taken.
+    up && dec < 90.0 && of("LATPOLE", 90.0) > 0.0 && !moved.iter().any(|key| keys.has(key))
 }
 
 /// The matrix from pixels to the units of the axes. A header of zeros has none.

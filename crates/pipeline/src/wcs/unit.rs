@@ -24,7 +24,9 @@ const PREFIXES: [&str; 6] = ["", "M", "U", "N", "MICRO", "NANO"];
 /// What the pixels are in place of light.
 pub(super) fn other_than_light(unit: &str) -> Option<&'static str> {
     let unit = unit.to_ascii_uppercase();
-    let words = || unit.split(|c: char| !c.is_ascii_alphabetic());
+    // Remarks in brackets may name a zero point.
+    let before = unit.split('(').next().unwrap_or_default();
+    let words = || before.split(|c: char| !c.is_ascii_alphabetic());
     if words().any(|word| MAGNITUDES.contains(&word)) {
         return Some("magnitudes");
     }
@@ -55,10 +57,11 @@ pub(super) fn other_than_light(unit: &str) -> Option<&'static str> {
     } else {
         power
     };
+    let is_inverse = unit.trim_start().starts_with("1/");
     match power {
         _ if !is_light => None,
-        _ if power.starts_with('2') => Some("variances"),
-        _ if power.starts_with("-2") => Some("inverse variances"),
+        _ if power.starts_with('2') && !is_inverse => Some("variances"),
+        _ if power.starts_with("-2") || power.starts_with('2') => Some("inverse variances"),
         _ => None,
     }
 }
@@ -81,6 +84,8 @@ mod tests {
             ("1e-2 nJy ** 2", Some("variances")),
             ("Variance", Some("variances")),
             ("adu**-2", Some("inverse variances")),
+            ("1/adu^2", Some("inverse variances")),
+            ("count (MAG ZP 25)", None),
             ("", None),
             ("adu", None),
             ("e-", None),
