@@ -398,8 +398,8 @@ const M_BY_GIVEN_VARIANCE: f64 = 0.077;
 // m times the S/N and the noise of a pixel in electrons: docs/survey.md, S/N 30 over 100 and 10 electrons of sky, +0.004 and +0.013.
 const M_BY_POISSON_NOISE: f64 = 1.2;
 // Least m that is stated: what Euclid requires.
-const MIN_ELECTRONS: f64 = 2.0; // Of noise per pixel: detectors read with more, so that below it the gain is not that of the pixels.
 const MIN_POISSON_M: f64 = 0.002;
+const MIN_ELECTRONS: f64 = 2.0; // Of noise per pixel: detectors read with more, so that below it the gain is not that of the pixels.
 // The column `snr` in units of the S/N: docs/limitations.md.
 const SNR_COLUMN: f64 = 0.74;
 // Share of negative fluxes of galaxies at S/N 5, whose column `snr` is 3.7 in the mean.
