@@ -19,8 +19,8 @@ use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_render::escape::line;
 use shearq_render::table::TableFormat;
-use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
+use shearq_results::submit::{Sent, Submission};
 use shearq_simulate::scene::SceneSimulator;
 
 use super::check::report;
@@ -370,29 +370,24 @@ fn new_scenes(
 }
 
 // The form of an entry of scenes.
-fn check_scenes(entry: &Path, challenge: &Challenge, is_json: bool) -> anyhow::Result<()> {
-    let sent = match challenge.open(entry) {
-        Ok(sent) => sent,
-        Err(error) => return report(&[Finding::unreadable(error)], entry, is_json),
-    };
+fn check_scenes(sent: &Sent, entry: &Path, sets: &[u32]) -> Vec<Finding> {
     let finding = |severity, message| Finding {
         path: entry.to_owned(),
         severity,
         check: "catalogues",
         message,
     };
-    let findings = match scenes::check(&sent, &challenge.data.sets) {
+    match scenes::check(sent, sets) {
         Ok((columns, undivided)) => {
             columns.iter().for_each(|line| tell(format_args!("{line}")));
             let warning = undivided.map(|text| finding(Severity::Warning, text));
             warning.into_iter().collect()
         }
         Err(error) => {
-            let message = scenes::shortened(&error.to_string(), &sent);
+            let message = scenes::shortened(&error.to_string(), sent);
             vec![finding(Severity::Error, message)]
         }
-    };
-    report(&findings, entry, is_json)
+    }
 }
 
 // Signs the arrival of an entry without errors.
@@ -423,15 +418,16 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     if is_there(entry) {
         inbox::refuse_links(entry, &challenge.data)?;
     }
-    if challenge.data.scene.is_some() {
-        check_scenes(entry, &challenge, summary.is_json())?;
-        return sign(judge.as_ref(), entry, team.as_deref());
-    }
-    let expected = challenge.expected()?;
     let sent = match challenge.open(entry) {
         Ok(sent) => sent,
         Err(error) => return report(&[Finding::unreadable(error)], entry, summary.is_json()),
     };
+    if challenge.data.scene.is_some() {
+        let findings = check_scenes(&sent, entry, &challenge.data.sets);
+        report(&findings, entry, summary.is_json())?;
+        return sign(judge.as_ref(), entry, team.as_deref());
+    }
+    let expected = challenge.expected()?;
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
     // Unreadable entries are among the findings already.
     if let Ok(submission) = Submission::read(&sent) {

@@ -95,9 +95,7 @@ impl Found {
         }
         let mut inside = list(folder)?;
         inside.sort();
-        // An inbox is none, because the names of others in it state a scene.
-        let is_own = depth > 0 || scenes::is_mostly_scenes(&inside);
-        if of_scenes && is_own && scenes::is_entry(&inside) {
+        if of_scenes && scenes::is_entry(&inside, depth == 0) {
             self.add(folder, team, depth);
             return Ok(());
         }
@@ -217,7 +215,7 @@ pub fn identify(path: &Path, data: &Data) -> Result<String, FileError> {
         return Err(FileError::new(path, message));
     }
     Ok(match path.is_dir() {
-        true => sha256(&list_of(&sums_of(path, &files)?)),
+        true => sha256(&list_of(&FileSum::of_files(path, &files)?)),
         false => FileSum::of(path)?.sha256,
     })
 }
@@ -250,15 +248,6 @@ fn files_of(folder: &Path, data: &Data) -> Result<Vec<PathBuf>, FileError> {
     Ok(paths)
 }
 
-// Checksums of the files of a folder, by their names below it.
-fn sums_of(folder: &Path, files: &[PathBuf]) -> Result<Vec<(String, FileSum)>, FileError> {
-    let sum = |file: &PathBuf| {
-        let name = file.strip_prefix(folder).unwrap_or(file).to_string_lossy();
-        Ok((name.into_owned(), FileSum::of(file)?))
-    };
-    files.iter().map(sum).collect()
-}
-
 fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
     let lines = sums
         .iter()
@@ -289,7 +278,7 @@ pub fn content(sending: &Sending, data: &Data) -> Result<Content, FileError> {
         }
         true => (
             Manifest::read(path)?,
-            sums_of(path, &files_of(path, data)?)?,
+            FileSum::of_files(path, &files_of(path, data)?)?,
         ),
         false if has_archive(path) => {
             let unpacked = read_archive(path, None, Some(data.largest_entry()))?;

@@ -605,13 +605,13 @@ impl Judge {
         let shears = self.constant.as_ref();
         let shear = |scene| shears.map_or([f64::NAN; 2], |all| all.of_set(scene));
         let sets = &self.challenge.data.sets;
-        // What is wrong without the truth is told in full, and does not count.
-        let summed = scenes::check(sent, sets)
-            .and_then(|_| scenes::summed(sent, sets, shear))
-            .map_err(|error| scenes::shortened(&error.to_string(), sent))?;
+        let in_words = |error: scenes::SceneError| scenes::shortened(&error.to_string(), sent);
+        let summed = scenes::summed(sent, sets, shear).map_err(in_words)?;
         let mut verdict = Verdict::default();
         match SceneScore::new(&summed, scene.arcmin2) {
             Err(error) => {
+                // What is wrong without the truth, too, is told in full, and does not count.
+                scenes::check(sent, sets).map_err(in_words)?;
                 let text = scenes::shortened(&error.to_string(), sent);
                 verdict.findings.push(text);
             }

@@ -153,15 +153,17 @@ fn is_part(path: &Path) -> bool {
     path.ends_with(RUN_FILE) || (path.file_name().is_some_and(of_scene) && !is_archive(path))
 }
 
-/// Whether a folder is an entry: `detect` wrote it, or the names of what it contains state scenes.
-pub fn is_entry(inside: &[PathBuf]) -> bool {
-    inside.iter().any(|path| is_part(path))
-}
-
-/// Whether most of what a folder contains are parts of one entry.
-pub fn is_mostly_scenes(inside: &[PathBuf]) -> bool {
+/// Whether a folder is an entry: `detect` wrote it, or names of what it contains state scenes. Where an inbox may be (`is_outer`), most
+/// of them must, because the name of a team or of its archive could, too.
+pub fn is_entry(inside: &[PathBuf], is_outer: bool) -> bool {
+    let parts = inside.iter().filter(|path| is_part(path)).count();
     let is_run = inside.iter().any(|path| path.ends_with(RUN_FILE));
-    is_run || 2 * inside.iter().filter(|path| is_part(path)).count() > inside.len()
+    is_run
+        || if is_outer {
+            2 * parts > inside.len()
+        } else {
+            parts > 0
+        }
 }
 
 /// The catalogues of an entry that is a folder, in order of their paths. They may be in folders, and `detect` writes the record of
@@ -300,8 +302,10 @@ mod tests {
 
     #[test]
     fn an_inbox_is_no_entry_because_of_one_name() {
-        let of =
-            |names: &[&str]| is_mostly_scenes(&names.iter().map(PathBuf::from).collect::<Vec<_>>());
+        let of = |names: &[&str]| {
+            let inside: Vec<PathBuf> = names.iter().map(PathBuf::from).collect();
+            is_entry(&inside, true)
+        };
         assert!(of(&["scene-001.csv", "scene-002.csv", "notes.txt"]) && of(&[RUN_FILE, "set01"]));
         assert!(!of(&["scene-1-team.tar.gz"]) && !of(&["honest", "Scene-7"]));
     }

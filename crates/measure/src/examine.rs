@@ -22,7 +22,7 @@ use crate::psf::{PsfQuality, Psfs, Star, psf_warnings};
 use crate::random::hash;
 use crate::sky::{INNER_AREA, INNER_RADIUS, inner_light};
 use crate::stamp::{FullStamp, SkySubtraction};
-use crate::warning::Warning;
+use crate::warning::{NEAR_SATURATION, Warning};
 
 // Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.
 const BLOCK: usize = 8;
@@ -99,8 +99,6 @@ const CLIPPED_SHARE: std::ops::RangeInclusive<f64> = 0.02..=0.95;
 const MIN_FLAT_TOP: usize = 3;
 // Share of stamps with a flat top. Chosen by hand.
 const FLAT_TOPS: f64 = 0.05;
-// Of the level of saturation, from which detectors are rarely linear to a per cent. Chosen by hand.
-const NEAR_SATURATION: f64 = 0.8;
 // Share of equal neighbours from which all values repeat, as whole numbers do. Chosen by hand.
 const MAX_EQUAL_SHARE: f64 = 0.005;
 // Noise over the peak below which symmetric galaxies may have equal pixels. Chosen by hand.

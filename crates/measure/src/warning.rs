@@ -267,7 +267,7 @@ pub enum Warning {
     #[error("several pixels have the brightest value of their stamp on {count} of {of} stamps (expected one pixel), as if light above it were cut off, which biases shears{}", tried(self.hint()))]
     FlatTops { count: usize, of: usize },
     /// Many galaxies come near the level at which the header states that pixels saturate.
-    #[error("the brightest pixel of {count} of {of} stamps is above 0.8 of SATURATE of the header, {} (expected fainter galaxies): if the detector's response falls by 5 % there, m changes by about -0.009{}", significant(*level, 5), tried(self.hint()))]
+    #[error("the brightest pixel of {count} of {of} stamps is above {near} of SATURATE of the header, {} (expected fainter galaxies): if the detector's response falls by 5 % there, m changes by about -0.009{}", significant(*level, 5), tried(self.hint()), near = NEAR_SATURATION)]
     NearSaturation { level: f64, count: usize, of: usize },
     /// The header states a gain, and galaxies have Poisson noise that the noise of the sky lacks.
     #[error("the noise is that of the sky, without the Poisson noise of the galaxies (found a gain of {} in the header, hence {:.1} electrons of noise per pixel, and a median S/N of {snr:.0}), which changes m by about {m:+.3}{}", significant(*gain, 3), electrons, tried(self.hint()))]
@@ -409,6 +409,8 @@ const MAX_NEGATIVE_OF_FAINT: f64 = 0.1;
 // Pixels without light per stamp that has any, up to which darker ones than bright ones are tails of the noise: Student's t of 5 degrees of
 // freedom has 1.1 (0.77 of them dark), with m as without tails. Dead pixels and fill values come in areas, and cosmic rays are bright.
 const MAX_TAIL_PIXELS: f64 = 1.5;
+// Of the level of saturation, from which detectors are rarely linear to a per cent. Chosen by hand.
+pub(crate) const NEAR_SATURATION: f64 = 0.8;
 // Standard deviations of a number beyond chance. Chosen by hand.
 const MIN_EXCESS: f64 = 5.0;
 // Relative difference of a noise level from a power of another one that is taken for it. Chosen by hand.

@@ -255,7 +255,7 @@ impl Submission {
         let files = sent.files()?;
         let manifest = Manifest::read(&sent.path)?;
         if let Some(manifest) = &manifest {
-            let sums = FileSum::of_files(&files)?;
+            let sums = FileSum::of_files(&sent.path, &files)?;
             manifest.verify(&sums.into_iter().collect(), &sent.given)?;
         }
         let mut catalogues = BTreeMap::<u32, BTreeMap<u32, PathBuf>>::new();

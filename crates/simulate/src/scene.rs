@@ -27,7 +27,7 @@ use super::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
 use super::galaxy::{Galaxy, Sersic};
 use super::noise::add_noise;
 use super::render::{RenderScratch, Renderer, stamp_side};
-use super::set::{NOISE_SIGMA, SettingsError, stream_of};
+use super::set::{NOISE_SIGMA, SettingsError, is_zero, stream_of};
 use super::signal::power;
 
 /// Pixels a side of the star image of a scene.
@@ -83,7 +83,7 @@ pub enum Layout {
 pub struct SceneSettings {
     pub seed: u64,
     /// 64 more bits of the seed of a blind challenge, so that nobody finds it by trying.
-    #[serde(default, skip_serializing_if = "has_no_bits")]
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub seed_high: u64,
     /// Pixels a side.
     pub side: usize,
@@ -97,7 +97,7 @@ pub struct SceneSettings {
     pub psf_shape: [f64; 2],
     /// Relative change of the FWHM of the PSF from the middle of the scene to its right edge, and the change of e1 on that way and of e2
     /// from the middle to the upper edge.
-    #[serde(default, skip_serializing_if = "is_constant")]
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub psf_gradient: [f64; 2],
     pub layout: Layout,
     /// Galaxies per arcmin².
@@ -120,18 +120,6 @@ pub struct SceneSettings {
     /// Whether the noise of every pixel has the opposite sign.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub negative_noise: bool,
-}
-
-fn is_zero(number: &usize) -> bool {
-    *number == 0
-}
-
-fn is_constant(gradient: &[f64; 2]) -> bool {
-    *gradient == [0.0; 2]
-}
-
-fn has_no_bits(half: &u64) -> bool {
-    *half == 0
 }
 
 impl Default for SceneSettings {

@@ -97,8 +97,8 @@ pub struct SimulationSettings {
     pub rotated: bool,
 }
 
-fn is_zero(number: &u64) -> bool {
-    *number == 0
+pub(crate) fn is_zero<T: Default + PartialEq>(number: &T) -> bool {
+    *number == T::default()
 }
 
 /// What all images of a set with fixed PSFs share.

@@ -428,18 +428,14 @@ impl Wcs {
         };
         // The default of LONPOLE for zenithal projections; PVi_3 of the axis of longitudes replaces the key (Calabretta & Greisen
         // 2002).
-        let default = match kind_of_sky {
-            SkyProjection::PlateCarree => 180.0,
-            _ if dec >= 90.0 => 0.0,
-            _ => 180.0,
-        };
+        let default = if dec >= 90.0 { 0.0 } else { 180.0 };
         let by_pv = match distortion.tpv {
             None => keys.number(&format!("PV{}_3", longitude + 1)),
             Some(_) => None,
         };
         let lonpole = match kind_of_sky {
-            SkyProjection::PlateCarree => None,
-            _ => by_pv.or_else(|| keys.number("LONPOLE")),
+            SkyProjection::PlateCarree => 180.0,
+            _ => by_pv.or_else(|| keys.number("LONPOLE")).unwrap_or(default),
         };
         let Distortion {
             sip,
@@ -460,7 +456,7 @@ impl Wcs {
                     kind: kind_of_sky,
                     ra,
                     dec,
-                    lonpole: lonpole.unwrap_or(default).to_radians(),
+                    lonpole: lonpole.to_radians(),
                     tpv,
                 },
             }),

@@ -108,10 +108,10 @@ impl FileSum {
         })
     }
 
-    /// The checksums of files with their names.
-    pub fn of_files(files: &[PathBuf]) -> Result<Vec<(String, Self)>, FileError> {
+    /// The checksums of files with their names below `folder`.
+    pub fn of_files(folder: &Path, files: &[PathBuf]) -> Result<Vec<(String, Self)>, FileError> {
         let sum = |file: &PathBuf| {
-            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            let name = file.strip_prefix(folder).unwrap_or(file).to_string_lossy();
             Ok((name.into_owned(), FileSum::of(file)?))
         };
         files.iter().map(sum).collect()
