@@ -255,6 +255,27 @@ fn a_catalogue_of_each_shear_makes_a_set() {
 }
 
 #[test]
+fn catalogues_without_weight_or_response_count_less() {
+    let effective = |second: [f64; 2]| {
+        let mut sums = UnitSums::new(Layout::default(), 1, 2);
+        for (number, [first, other]) in (0..).zip([[1.0, 1.0], second]) {
+            let response = [[first, 0.0], [0.0, other]];
+            let of_two = Row {
+                response,
+                ..row([0.1; 2], 1.0, PAIR[0])
+            };
+            // In two units of a catalogue.
+            (0..2).for_each(|key| sums.add(number, key, 0, &of_two));
+        }
+        sums.effective_catalogues()
+    };
+    assert_eq!(effective([1.0, 1.0]), 2.0);
+    // (1 + 3)²/(1 + 9), and the component with the smaller number.
+    assert_eq!(effective([3.0, 1.0]), 1.6);
+    assert_eq!(effective([1.0, 0.0]), 1.0);
+}
+
+#[test]
 fn without_names_the_assumption_is_stated() {
     let sums = |count: u32| {
         let mut sums = UnitSums::new(Layout::default(), 1, count as usize);

@@ -472,6 +472,27 @@ mod tests {
     }
 
     #[test]
+    fn noise_that_is_sheared_along_is_taken_out_of_the_size() {
+        let galaxy = found();
+        let (own, noise) = (
+            galaxy.observables.as_ref().unwrap(),
+            galaxy.noise_moments.as_ref().unwrap(),
+        );
+        let found = galaxy.measurement(SATURATIONS[0], 1.0).observables.unwrap();
+        let (first, second) = (own.size.slope, own.size.curvature);
+        for k in 0..2 {
+            let means = &noise.sheared[k];
+            // Of a function of T, of which the mean of the second derivative and of the squared change are known.
+            let by_noise = first * means.curvature[2] + second * means.products[[2 + SIZE; 2]];
+            close(
+                found.size_response[k],
+                first * own.square_response[k] - by_noise,
+                1e-12,
+            );
+        }
+    }
+
+    #[test]
     fn turned_galaxies_turn_all_that_refers_to_shear() {
         // A rotation by 90° changes the signs of spin-2 components and of nothing else; a reflection those of e2 and γ2.
         let quarter = [[0.0, -1.0], [1.0, 0.0]];
