@@ -9,7 +9,7 @@ use shearq_dataset::threads::Quiet;
 use shearq_detection::Cells;
 use shearq_measure::{DetectionMethod, Jacobian, MeasureError, StampNoise};
 use shearq_pipeline::detect::{
-    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, unlit_in_words,
+    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, measured_level, unlit_in_words,
 };
 
 use crate::errors::{of_measuring, of_pipeline};
@@ -89,7 +89,7 @@ pub(crate) fn detect<'py>(
         let place = [x as f64 / width as f64, y as f64 / height as f64];
         (place, image[[y, x]])
     });
-    let mut doubts = doubts(cells.stars(), sky, noise, None);
+    let mut doubts = doubts(cells.stars(), sky, noise, measured_level(image));
     doubts.extend(unlit_in_words(unlit));
     Ok((columns, doubts))
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import shearq
@@ -65,6 +67,15 @@ def test_a_psf_that_varies_is_drawn_at_its_places() -> None:
 
     with pytest.raises(ValueError, match="psf: .* at x = 228.0, y = 33.0 sum to -"):
         shearq.detect(pixels, negative, noise=1.0)
+
+
+def test_a_wrong_noise_level_is_named() -> None:
+    pixels = np.random.default_rng(8).normal(0.0, 3.0, (300, 300)).astype(np.float32)
+    with pytest.warns(shearq.DataWarning, match="the noise is stated as 9.0000, and measured as (2.9|3.0)"):
+        shearq.detect(pixels, STAR, noise=9.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shearq.detect(pixels, STAR, noise=3.0)
 
 
 def test_a_wcs_turns_shapes_to_the_sky() -> None:

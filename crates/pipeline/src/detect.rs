@@ -643,6 +643,26 @@ fn unmeasured(exposure: &Exposure<'_>) -> FileError {
 }
 
 fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise, PipelineError> {
+    Ok(noise_of(stamps)?.ok_or_else(|| unmeasured(exposure))?)
+}
+
+/// The standard deviation of the noise of an image (ny, nx), NaN where pixels are missing; `None` if it cannot be measured.
+pub fn measured_level(image: ArrayView2<'_, f32>) -> Option<f64> {
+    let (height, width) = image.dim();
+    let mut stamps = Vec::new();
+    for y in grid(height) {
+        for x in grid(width) {
+            let around =
+                |at: usize| (0..NOISE_STAMP).map(move |k| (at + k).wrapping_sub(NOISE_STAMP / 2));
+            let pixels = around(y).flat_map(|y| around(x).map(move |x| [y, x]));
+            stamps.extend(pixels.map(|at| image.get(at).copied().unwrap_or(f32::NAN)));
+        }
+    }
+    Some(noise_of(&stamps).ok()??.sigma())
+}
+
+// The noise of stamps one after the other; `None` if they do not show it.
+fn noise_of(stamps: &[f32]) -> Result<Option<StampNoise>, MeasureError> {
     let mut survey = NoisePlan::new(NOISE_STAMP, MAX_LAG, None)?.survey();
     for stamp in stamps.chunks_exact(STAMP_PIXELS) {
         if let Ok(stamp) = ArrayView2::from_shape((NOISE_STAMP, NOISE_STAMP), stamp) {
@@ -650,12 +670,11 @@ fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise,
         }
     }
     let found = survey.result()?.map(|found| found.noise);
-    let found = found.ok_or_else(|| unmeasured(exposure))?;
-    Ok(match found.is_correlated() {
+    Ok(found.map(|found| match found.is_correlated() {
         true => found,
         // What is measured of the correlation of white noise is noise.
         false => StampNoise::white(found.sigma()),
-    })
+    }))
 }
 
 /// A column of catalogues: its name and its values.
