@@ -999,7 +999,13 @@ impl MeasuredImage<'_> {
         let of_galaxies = Warning::of_galaxies(&galaxies);
         let is_known = |one: &Warning| levels_differ && matches!(one, Warning::Empty { .. });
         warnings.extend(of_galaxies.filter(|one| !is_known(one)));
-        let unused_gain = session.detector.gain.filter(|_| session.gain.is_none());
+        // Of correlated noise, the level of a pixel is not the noise that a galaxy has.
+        let is_white = session
+            .survey
+            .as_ref()
+            .is_none_or(|survey| !survey.noise.is_correlated());
+        let is_unused = session.gain.is_none() && is_white;
+        let unused_gain = session.detector.gain.filter(|_| is_unused);
         warnings.extend(unused_gain.and_then(|gain| Warning::of_poisson(&galaxies, gain)));
         if let Some(mean) = &response
             && !mean.is_significant

@@ -411,6 +411,8 @@ const MAX_NEGATIVE_OF_FAINT: f64 = 0.1;
 const MAX_TAIL_PIXELS: f64 = 1.5;
 // Of the level of saturation, from which detectors are rarely linear to a per cent. Chosen by hand.
 pub(crate) const NEAR_SATURATION: f64 = 0.8;
+// Bright pixels among tails, in units of the dark ones: 0.3 of Student's t of 5 degrees of freedom, because light hides others. Chosen by hand.
+const BRIGHT_TAILS: [f64; 2] = [0.1, 0.7];
 // Standard deviations of a number beyond chance. Chosen by hand.
 const MIN_EXCESS: f64 = 5.0;
 // Relative difference of a noise level from a power of another one that is taken for it. Chosen by hand.
@@ -764,7 +766,12 @@ fn negative_by_more_than_chance(snr: &[f64]) -> Option<usize> {
 fn are_tails(counts: DefectCounts, stamps: usize) -> bool {
     let DefectCounts { dark, bright, .. } = counts;
     let few = f64::from(counts.total()) <= MAX_TAIL_PIXELS * stamps as f64;
-    few && dark >= bright && dark + bright == counts.total()
+    // Dead pixels alone are dark, and as many hot ones are no tails.
+    let (least, most) = (
+        BRIGHT_TAILS[0] * f64::from(dark),
+        BRIGHT_TAILS[1] * f64::from(dark),
+    );
+    few && (least..=most).contains(&f64::from(bright)) && dark + bright == counts.total()
 }
 
 /// A number with `digits` significant digits, in whatever unit pixels have.
@@ -837,6 +844,8 @@ mod tests {
         // Cosmic rays, areas of fill values, and bad columns.
         assert!(!are_tails(counts(3, 47), 50));
         assert!(!are_tails(counts(500, 0), 10));
+        // A dead pixel on each stamp, and a hot one on half of them.
+        assert!(!are_tails(counts(80, 0), 80) && !are_tails(counts(40, 40), 80));
         let lines = DefectCounts {
             lines: 48,
             ..counts(1, 0)
