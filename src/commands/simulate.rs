@@ -29,7 +29,8 @@ use shearq_simulate::set::SimulationSettings;
 /// command resumes a stopped simulation.
 ///
 /// With --constant-shear all galaxies have one shear. Several shears, --opposite or --rotated make a folder for each
-/// version of the same galaxies, with the same noise: OUT/g1_+0.02_g2_+0 and so on. `bias` recognises the pairs.
+/// version of the same galaxies, with the same noise: OUT/g1_+0.02_g2_+0 and so on, and OUT/plus and OUT/minus of scenes with a shear
+/// each. --opposite-noise adds versions with the same noise of the other sign (OUT/plus_noise). `bias` recognises the pairs.
 ///
 /// With --scenes the command writes exposures of fields whose galaxies lie anywhere and blend, to test a pipeline with its
 /// detection (docs/scenes.md): OUT/scene-001.fits, …, psf.fits, truth-001.csv with all galaxies, and shears.csv for `bias --truth`. The shear
@@ -97,7 +98,7 @@ pub(super) struct SceneArguments {
     /// Pixels a side of a scene.
     #[arg(long, value_name = "PX", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().side)]
     side: usize,
-    /// Pixels along the edges of a scene without galaxies and stars, so that none crosses an edge under one of several shears.
+    /// Pixels along the edges of a scene without galaxies and stars, so that shears move none across an edge.
     #[arg(long, value_name = "PX", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().border)]
     border: usize,
     /// Arcseconds per pixel of a scene.
@@ -109,8 +110,8 @@ pub(super) struct SceneArguments {
     /// Ellipticity ε of the PSF of a scene [default: 0.03,-0.02].
     #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with = OTHER_DATA, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_shape: Option<[f64; 2]>,
-    /// Change of the PSF over a scene, of which model.psf is a model as PSFEx has it: relative, of the FWHM from the middle to the right
-    /// edge, and of the ellipticity, of e1 on that way and of e2 to the upper edge.
+    /// Change of the PSF from the middle of a scene to its edges: the share by which the FWHM grows to the right edge, and the ellipticity
+    /// that is added to e1 at the right edge and to e2 at the upper one. A model like PSFEx's is written, too: model.psf.
     #[arg(long, value_name = "FWHM,E", requires = "scenes", conflicts_with = OTHER_DATA, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_gradient: Option<[f64; 2]>,
     /// Galaxies per arcmin².
@@ -125,6 +126,12 @@ pub(super) struct SceneArguments {
     /// Stars per arcmin², of S/N 50 to 2000.
     #[arg(long, value_name = "N", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().star_density)]
     stars: f64,
+    /// Exposures of each scene: scene-001.fits, and scene-001-epoch-2.fits and so on with the camera turned and moved at random.
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with = OTHER_DATA, default_value_t = SceneSettings::default().epochs)]
+    epochs: u32,
+    /// Electrons per unit of the image, of which the light has noise, too [default: the noise is the same everywhere].
+    #[arg(long, value_name = "GAIN", requires = "scenes", conflicts_with = OTHER_DATA)]
+    gain: Option<f64>,
     /// Where galaxies are: `random`, or on a `hexagonal` lattice, without blends.
     #[arg(long, value_name = "LAYOUT", requires = "scenes", conflicts_with = OTHER_DATA, default_value = "random", value_parser = layout())]
     layout: Layout,
@@ -318,6 +325,8 @@ impl SceneArguments {
             snr: self.snr.unwrap_or(default.snr),
             counts_slope: self.counts_slope,
             star_density: self.stars,
+            epochs: self.epochs,
+            gain: self.gain,
             ..default
         }
     }
@@ -357,7 +366,8 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
         ));
     }
     let objects: usize = simulators.iter().map(|(own, _)| own.objects()).sum();
-    let mut bar = Bar::new("simulating", u64::from(scenes) * objects as u64);
+    let exposures = u64::from(scenes) * u64::from(settings.epochs);
+    let mut bar = Bar::new("simulating", exposures * objects as u64);
     let mut made = 0;
     for (simulator, out) in &simulators {
         let record = SceneRecord {
@@ -375,9 +385,14 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
     drop(bar);
     let of_versions = simulators.iter().map(|(own, out)| (own, out.as_path()));
     write_shears(of_versions, scenes, &arguments.out)?;
-    let all = scenes as usize * simulators.len();
+    let all = exposures as usize * simulators.len();
     tell(format_args!(
-        "{made} scenes of {:.2} arcmin² simulated, {} there already, in {}; true shears in {}",
+        "{made} {} of {:.2} arcmin² simulated, {} there already, in {}; true shears in {}",
+        if settings.epochs > 1 {
+            "exposures"
+        } else {
+            "scenes"
+        },
         settings.area_arcmin2(),
         all - made,
         arguments.out.display(),

@@ -126,6 +126,31 @@ fn places_on_the_sky_are_those_of_the_header() {
 }
 
 #[test]
+fn epochs_of_a_scene_have_the_same_sky() {
+    let folder = Folder::new();
+    let scene = "--scenes 1 --side 700 --border 160 --layout hexagonal --density 25 --snr 300,400";
+    let simulate = format!("simulate {scene} --epochs 2 --out scene");
+    assert_has(&folder.said(&simulate), "2 exposures of");
+    let whole = contents(&folder.at("scene"));
+    folder.remove("scene/scene-001-epoch-2.fits");
+    assert_has(&folder.said(&simulate), "1 exposures of");
+    assert!(whole == contents(&folder.at("scene")));
+    folder.run("gather --exposure scene/scene-001.fits scene/scene-001-epoch-2.fits --psf scene/psf.fits scene/psf.fits --positions scene/truth-001.csv --degrees --frame sky --out stamps");
+    folder.run(
+        "measure --submission 48/linear/star --data stamps --catalogue-format csv --out shapes",
+    );
+    let [first, second] = [1, 2].map(|epoch| {
+        let path = folder.at(&format!("shapes/set01/catalogue-00{epoch}.csv"));
+        csv(&path, &["e1", "e2"])
+    });
+    // Shapes have a scatter of 0.2, noise of S/N 300 one of 0.004.
+    let off = first.iter().flatten().zip(second.iter().flatten());
+    let off: Vec<f64> = off.map(|(a, b)| (a - b).abs()).collect();
+    let largest = off.iter().copied().fold(0.0, f64::max);
+    assert!(off.len() > 20 && largest < 0.03, "{largest} {}", off.len());
+}
+
+#[test]
 fn mean_says_that_crowded_positions_are_without_detection() {
     let folder = Folder::new();
     let said = |layout: &str| {

@@ -12,7 +12,7 @@ use shearq_dataset::threads::Progress;
 use shearq_files::fits::{ImageWriter, Value, write_vector};
 use shearq_files::{FileError, atomic};
 use shearq_simulate::render::RenderScratch;
-use shearq_simulate::scene::{STAR, SceneSettings, SceneSimulator, Source, Stamp};
+use shearq_simulate::scene::{STAR, SceneSettings, SceneSimulator, Source, Stamp, View};
 use shearq_simulate::set::NOISE_SIGMA;
 
 use super::PipelineError;
@@ -47,6 +47,7 @@ pub struct SceneRecord {
 
 struct Chunk {
     scene: u32,
+    epoch: u32,
     objects: Range<usize>,
     is_last: bool,
 }
@@ -76,24 +77,30 @@ pub fn simulate_scenes(
 ) -> Result<usize, PipelineError> {
     let claim = claim(&secret.join(SIMULATION_FILE), record, SCENE)?;
     let side = simulator.settings().side;
-    let path = |scene| images.join(fill(SCENE, 0, scene));
-    let todo: Vec<u32> = (1..=scenes)
-        .filter(|scene| !(is_whole(&path(*scene), side) && truth_path(secret, *scene).exists()))
+    let path = |(scene, epoch)| images.join(exposure_name(scene, epoch));
+    let epochs = 1..=simulator.settings().epochs;
+    let all: Vec<(u32, u32)> = (1..=scenes)
+        .flat_map(|scene| epochs.clone().map(move |epoch| (scene, epoch)))
         .collect();
+    let is_there = |&own: &(u32, u32)| {
+        is_whole(&path(own), side) && (own.1 > 1 || truth_path(secret, own.0).exists())
+    };
+    let todo: Vec<(u32, u32)> = all.iter().copied().filter(|own| !is_there(own)).collect();
     write_star(simulator, record, images)?;
     let objects = simulator.objects();
-    progress.skip((scenes as usize - todo.len()) as u64 * objects as u64);
+    progress.skip((all.len() - todo.len()) as u64 * objects as u64);
     let mut image = Array2::zeros((side, side));
     let mut truth = TruthTable::new(simulator.settings());
     engine::ordered(
         threads,
         |feeder| {
-            for &scene in &todo {
+            for &(scene, epoch) in &todo {
                 // At least one chunk, also of a scene without objects.
                 for first in (0..objects.max(1)).step_by(CHUNK) {
                     let end = (first + CHUNK).min(objects);
                     let chunk = Chunk {
                         scene,
+                        epoch,
                         objects: first..end,
                         is_last: end == objects,
                     };
@@ -108,6 +115,8 @@ pub fn simulate_scenes(
         |scratch, chunk: Chunk| {
             let sources = chunk.objects.clone();
             let sources = sources.filter_map(|index| simulator.source(chunk.scene, index));
+            let view = simulator.settings().view(chunk.scene, chunk.epoch);
+            let sources = sources.filter_map(|source| simulator.seen(&source, view));
             let drawn: Vec<(Source, Stamp)> = sources
                 .map(|source| (source, simulator.draw(&source, scratch)))
                 .collect();
@@ -121,57 +130,74 @@ pub fn simulate_scenes(
             }
             if chunk.is_last {
                 claim.check()?;
-                simulator.add_noise(chunk.scene, &mut image);
+                let Chunk { scene, epoch, .. } = chunk;
+                simulator.add_noise(scene, epoch, &mut image);
                 // The image is written last, so that its file shows that the scene is complete.
                 let table = std::mem::replace(&mut truth, TruthTable::new(simulator.settings()));
-                table.write(&truth_path(secret, chunk.scene))?;
-                write_image(record, chunk.scene, &image, &path(chunk.scene))?;
+                if epoch == 1 {
+                    table.write(&truth_path(secret, scene))?;
+                }
+                write_image(record, (scene, epoch), &image, &path((scene, epoch)))?;
                 image.fill(0.0);
             }
             Ok(())
         },
     )
     .map_err(|error| claim.explain(error))?;
-    claim.check_results((1..=scenes).map(path))?;
+    claim.check_results(all.iter().copied().map(path))?;
     Ok(todo.len())
+}
+
+/// The file of an epoch (from 1) of a scene.
+pub fn exposure_name(scene: u32, epoch: u32) -> String {
+    match epoch {
+        1 => fill(SCENE, 0, scene),
+        _ => fill(SCENE, 0, scene).replace(".fits", &format!("-epoch-{epoch}.fits")),
+    }
 }
 
 fn truth_path(out: &Path, scene: u32) -> PathBuf {
     out.join(fill(TRUTH, 0, scene))
 }
 
-// Keys of a tangential projection with x to the west and y to the north.
-fn wcs_keys(settings: &SceneSettings) -> Vec<(&'static str, Value)> {
+// Keys of a tangential projection. In the first epoch x is to the west and y to the north.
+fn wcs_keys(settings: &SceneSettings, view: View) -> Vec<(&'static str, Value)> {
     let text = |text: &str| Value::Text(text.into());
-    let middle = Value::Real(0.5 * (settings.side as f64 + 1.0));
+    let middle = 0.5 * (settings.side as f64 + 1.0);
+    let [x, y] = view.dither.map(|offset| Value::Real(middle + offset));
     let pixel = settings.pixel_arcsec / 3600.0;
+    // From turned pixels back to those of the first epoch, and from there to the sky. Added to zero, which makes no minus zero.
+    let (sin, cos) = view.radians.sin_cos();
+    let sky = |value: f64| Value::Real(pixel * value + 0.0);
     let [ra, dec] = CENTRE_DEGREES.map(Value::Real);
     vec![
         ("CTYPE1", text("RA---TAN")),
         ("CTYPE2", text("DEC--TAN")),
         ("CUNIT1", text("deg")),
         ("CUNIT2", text("deg")),
-        ("CRPIX1", middle.clone()),
-        ("CRPIX2", middle),
+        ("CRPIX1", x),
+        ("CRPIX2", y),
         ("CRVAL1", ra),
         ("CRVAL2", dec),
-        ("CD1_1", Value::Real(-pixel)),
-        ("CD1_2", Value::Real(0.0)),
-        ("CD2_1", Value::Real(0.0)),
-        ("CD2_2", Value::Real(pixel)),
+        ("CD1_1", sky(-cos)),
+        ("CD1_2", sky(-sin)),
+        ("CD2_1", sky(-sin)),
+        ("CD2_2", sky(cos)),
     ]
 }
 
 // The same as [`Wcs`] reads it, so that positions in tables are those of the header.
 fn wcs(settings: &SceneSettings) -> Wcs {
-    let values = wcs_keys(settings).into_iter().map(|(key, value)| {
-        let value = match value {
-            Value::Int(number) => number.to_string(),
-            Value::Real(number) => number.to_string(),
-            Value::Text(text) => text,
-        };
-        (key.to_owned(), value)
-    });
+    let values = wcs_keys(settings, View::default())
+        .into_iter()
+        .map(|(key, value)| {
+            let value = match value {
+                Value::Int(number) => number.to_string(),
+                Value::Real(number) => number.to_string(),
+                Value::Text(text) => text,
+            };
+            (key.to_owned(), value)
+        });
     Wcs::of_keys(&Keys::new(values.collect::<BTreeMap<_, _>>()))
 }
 
@@ -181,16 +207,17 @@ fn creator(record: &SceneRecord) -> (&'static str, Value) {
 
 fn write_image(
     record: &SceneRecord,
-    scene: u32,
+    (scene, epoch): (u32, u32),
     image: &Array2<f32>,
     path: &Path,
 ) -> Result<(), FileError> {
-    let mut header = wcs_keys(&record.settings);
-    header.extend([
-        ("SCENE", Value::Int(i64::from(scene))),
-        ("NOISESIG", Value::Real(NOISE_SIGMA)),
-        creator(record),
-    ]);
+    let settings = &record.settings;
+    let mut header = wcs_keys(settings, settings.view(scene, epoch));
+    header.push(("SCENE", Value::Int(i64::from(scene))));
+    header.extend((epoch > 1).then_some(("EPOCH", Value::Int(i64::from(epoch)))));
+    header.push(("NOISESIG", Value::Real(NOISE_SIGMA)));
+    header.extend(settings.gain.map(|gain| ("GAIN", Value::Real(gain))));
+    header.push(creator(record));
     let (height, width) = image.dim();
     let mut writer = ImageWriter::create(path, width, height, &header)?;
     for row in image.rows() {
@@ -205,7 +232,11 @@ fn write_star(
     out: &Path,
 ) -> Result<(), FileError> {
     let pixel = record.settings.pixel_arcsec;
-    let mut header = Wcs::of_jacobian([[pixel, 0.0], [0.0, pixel]]).keys();
+    // Of turned exposures it is the PSF on the pixels of each, whatever their axes on the sky.
+    let mut header = match record.settings.epochs {
+        1 => Wcs::of_jacobian([[pixel, 0.0], [0.0, pixel]]).keys(),
+        _ => Vec::new(),
+    };
     header.push(creator(record));
     let mut writer = ImageWriter::create(out.join(STAR_FILE), STAR, STAR, &header)?;
     writer.write_rows(&simulator.star().into_raw_vec_and_offset().0)?;

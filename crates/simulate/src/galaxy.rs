@@ -348,6 +348,19 @@ impl Galaxy {
         Ok(self)
     }
 
+    /// The galaxy turned about the origin by an angle from +x to +y.
+    pub fn turned(mut self, radians: f64) -> Self {
+        let (sin, cos) = radians.sin_cos();
+        let (sin_2, cos_2) = (2.0 * radians).sin_cos();
+        for own in &mut self.components[..self.count] {
+            let (dx, dy) = (own.dx, own.dy);
+            (own.dx, own.dy) = (cos * dx - sin * dy, sin * dx + cos * dy);
+            let Shear { e1, e2 } = own.shape;
+            own.shape = Shear::new(cos_2 * e1 - sin_2 * e2, sin_2 * e1 + cos_2 * e2);
+        }
+        self
+    }
+
     pub fn components(&self) -> &[Component] {
         &self.components[..self.count]
     }

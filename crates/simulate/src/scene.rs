@@ -3,11 +3,11 @@
 //! A scene has one reduced shear. It acts on the shapes of the galaxies *and on their places*, about the centre of the field, as
 //! lensing does: a detection near a neighbour is lost or gained by how far apart the shear moves them, and such a bias is absent
 //! from galaxies whose places are fixed. Stars are not sheared, and all objects are behind one PSF, or one that varies
-//! over the scene.
+//! over the scene. A scene may have several epochs: of the same sky, with the camera moved and turned.
 //!
-//! Pixels count from 0 here, +x is to the west and +y to the north, so that pixel axes are those of the sky.
+//! Pixels count from 0 here, +x is to the west and +y to the north, so that pixel axes of the first epoch are those of the sky.
 //!
-//! Random numbers are ChaCha8 streams with the key (seed, scene, 0, purpose), which also has the high half of the seed, and the index of the object as the number of the
+//! Random numbers are ChaCha8 streams with the key (seed, scene, epoch from 0, purpose), which also has the high half of the seed, and the index of the object as the number of the
 //! stream. An object therefore depends neither on the order nor on the thread in which it is drawn, nor on the others.
 
 use std::f64::consts::TAU;
@@ -37,6 +37,8 @@ pub const STAR: usize = 64;
 const PSF: PsfProfile = PsfProfile::Moffat { beta: 3.0 };
 // FWHM in px: below, light is beyond the largest wavenumber that is drawn; above, it is beyond the stamps.
 const FWHM_PX: (f64, f64) = (1.8, 12.0);
+// Dithers of epochs along each axis are up to this, a third of the side of a small scene. Chosen by hand.
+const DITHER_PX: f64 = 20.0;
 // Beyond it, objects that a shear moves into the image are beyond the field that is populated.
 const MAX_SHEAR: f64 = 0.15;
 // Half side of the populated field over that of the image: (1 + √2·0.15)/√(1 − 0.15²) is the largest |x| that a shear brings to 1.
@@ -108,6 +110,12 @@ pub struct SceneSettings {
     pub counts_slope: f64,
     /// Stars per arcmin².
     pub star_density: f64,
+    /// Exposures of each scene. Those after the first are moved and turned at random, and have the same PSF on their pixels.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub epochs: u32,
+    /// Electrons per unit of the image: light has their noise, too. Without a number, all pixels have the same noise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
     /// The shear of all scenes; without one, each has its own, drawn as in GREAT3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub constant_shear: Option<[f64; 2]>,
@@ -120,6 +128,15 @@ pub struct SceneSettings {
     /// Whether the noise of every pixel has the opposite sign.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub negative_noise: bool,
+}
+
+fn one() -> u32 {
+    1
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde gives a reference")]
+fn is_one(count: &u32) -> bool {
+    *count == 1
 }
 
 impl Default for SceneSettings {
@@ -139,6 +156,8 @@ impl Default for SceneSettings {
             // Of deep counts in R; in I it is 0.27 (Smail et al. 1995, ApJ 449, L105).
             counts_slope: 0.32,
             star_density: 0.0,
+            epochs: 1,
+            gain: None,
             constant_shear: None,
             opposite: false,
             rotated: false,
@@ -162,6 +181,8 @@ impl<'de> Deserialize<'de> for SceneSettings {
     }
 }
 
+// More than deep surveys have in one filter.
+const MAX_EPOCHS: u32 = 999;
 // Objects of a field: 30 times those of the deepest surveys on the largest image.
 const MAX_OBJECTS: f64 = 1e8;
 
@@ -181,6 +202,8 @@ impl SceneSettings {
             snr: [faint, bright],
             counts_slope,
             star_density,
+            epochs,
+            gain,
             constant_shear,
             opposite: _,
             rotated: _,
@@ -246,6 +269,16 @@ impl SceneSettings {
             format!("the slope of number counts is {counts_slope}"),
             "above 0 and at most 2".into(),
         )?;
+        expect(
+            (1..=MAX_EPOCHS).contains(&epochs),
+            format!("a scene has {epochs} epochs"),
+            format!("1 to {MAX_EPOCHS}"),
+        )?;
+        expect(
+            gain.is_none_or(|gain| gain > 0.0 && gain.is_normal()),
+            format!("the gain is {}", gain.unwrap_or_default()),
+            "a positive number".into(),
+        )?;
         let [g1, g2] = constant_shear.unwrap_or_default();
         expect(
             g1.hypot(g2) <= MAX_SHEAR,
@@ -259,8 +292,18 @@ impl SceneSettings {
     // Half a side of the field that is populated, in pixels.
     fn half_field(&self) -> f64 {
         match self.border {
-            0 => FIELD_MARGIN * (0.5 * self.side as f64 + EDGE_PX),
+            0 => FIELD_MARGIN * (self.reach() + EDGE_PX),
             border => 0.5 * self.side as f64 - border as f64,
+        }
+    }
+
+    // Largest distance along an axis of the first epoch, in pixels from its middle, of a place on an image of any epoch.
+    fn reach(&self) -> f64 {
+        let half = 0.5 * self.side as f64;
+        match self.epochs {
+            1 => half,
+            // Corners of images that are turned.
+            _ => (half + DITHER_PX) * 2f64.sqrt(),
         }
     }
 
@@ -275,8 +318,35 @@ impl SceneSettings {
     }
 
     fn stream(&self, scene: u32, purpose: Purpose) -> ChaCha8Rng {
-        stream_of([self.seed, self.seed_high], [scene, 0], purpose as u64)
+        self.stream_of_epoch(scene, 1, purpose)
     }
+
+    fn stream_of_epoch(&self, scene: u32, epoch: u32, purpose: Purpose) -> ChaCha8Rng {
+        stream_of(
+            [self.seed, self.seed_high],
+            [scene, epoch - 1],
+            purpose as u64,
+        )
+    }
+
+    /// How an epoch (from 1) of a scene sees the sky. Versions of a scene are seen alike.
+    pub fn view(&self, scene: u32, epoch: u32) -> View {
+        if epoch == 1 {
+            return View::default();
+        }
+        let mut rng = self.stream_of_epoch(scene, epoch, Purpose::View);
+        View {
+            radians: rng.random_range(0.0..TAU),
+            dither: [0; 2].map(|_| rng.random_range(-DITHER_PX..DITHER_PX)),
+        }
+    }
+}
+
+/// Where a place of the first epoch is in another one: turned by an angle from +x to +y about the middle, and moved by pixels.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct View {
+    pub radians: f64,
+    pub dither: [f64; 2],
 }
 
 #[derive(Clone, Copy)]
@@ -286,6 +356,7 @@ enum Purpose {
     Galaxy,
     Star,
     Noise,
+    View,
 }
 
 /// A galaxy or a star that adds light to the image.
@@ -463,7 +534,7 @@ impl SceneSimulator {
             .expect("the transform is that of the PSF's profile")
     }
 
-    /// Object `index` of a scene; `None` if it adds no light to the image.
+    /// Object `index` of a scene; `None` if it adds no light to the images.
     pub fn source(&self, scene: u32, index: usize) -> Option<Source> {
         let settings = &self.settings;
         let (is_star, purpose, own) = match index.checked_sub(self.galaxies()) {
@@ -488,11 +559,11 @@ impl SceneSimulator {
             false => self.shear(scene),
         };
         let middle = 0.5 * (settings.side as f64 - 1.0);
-        let centre = apply(g.matrix(), place).map(|offset| middle + offset);
-        let edges = -0.5 - EDGE_PX..settings.side as f64 - 0.5 + EDGE_PX;
-        if !centre.iter().all(|at| edges.contains(at)) {
+        let offset = apply(g.matrix(), place);
+        if !is_within(offset, settings.reach() + EDGE_PX) {
             return None;
         }
+        let centre = offset.map(|offset| middle + offset);
         Some(match is_star {
             true => self.star_source(index, centre, &mut rng),
             false => self.galaxy_source(index, centre, g, &mut rng),
@@ -581,6 +652,22 @@ impl SceneSimulator {
         }
     }
 
+    /// A source as a view of the scene has it; `None` if it adds no light to that image.
+    pub fn seen(&self, source: &Source, view: View) -> Option<Source> {
+        let middle = 0.5 * (self.settings.side as f64 - 1.0);
+        let mut seen = *source;
+        // The first epoch keeps the bits.
+        if view != View::default() {
+            let [x, y] = source.centre.map(|at| at - middle);
+            let (sin, cos) = view.radians.sin_cos();
+            let turned = [cos * x - sin * y, sin * x + cos * y];
+            seen.centre = [0, 1].map(|axis| middle + turned[axis] + view.dither[axis]);
+            seen.light = source.light.turned(view.radians);
+        }
+        let offset = seen.centre.map(|at| at - middle);
+        is_within(offset, 0.5 * self.settings.side as f64 + EDGE_PX).then_some(seen)
+    }
+
     /// Draws a source. Its light beyond the stamp is below 10⁻⁴ of its peak.
     pub fn draw(&self, source: &Source, scratch: &mut RenderScratch) -> Stamp {
         let half = 0.5 * self.settings.side as f64;
@@ -601,22 +688,38 @@ impl SceneSimulator {
         }
     }
 
-    /// Adds the noise of a scene to the light of its sources, `[y, x]`. All versions of a scene have the same noise but for its sign,
-    /// whatever their galaxies.
-    pub fn add_noise(&self, scene: u32, image: &mut Array2<f32>) {
-        let mut rng = self.settings.stream(scene, Purpose::Noise);
+    /// Adds the noise of an epoch (from 1) of a scene to the light of its sources, `[y, x]`. All versions of a scene have the same noise but for its
+    /// sign, whatever their galaxies, unless light has noise.
+    pub fn add_noise(&self, scene: u32, epoch: u32, image: &mut Array2<f32>) {
+        let mut rng = (self.settings).stream_of_epoch(scene, epoch, Purpose::Noise);
         let sign = if self.settings.negative_noise {
             -1.0
         } else {
             1.0
         };
         let sigma = (sign * NOISE_SIGMA) as f32;
+        let mut noise = vec![0.0; image.ncols()];
         for mut row in image.rows_mut() {
-            if let Some(pixels) = row.as_slice_mut() {
+            let Some(pixels) = row.as_slice_mut() else {
+                continue;
+            };
+            let Some(gain) = self.settings.gain else {
                 add_noise(&mut rng, 1.0, sigma, pixels);
+                continue;
+            };
+            add_noise(&mut rng, 0.0, sigma, &mut noise);
+            // The variance of electrons is their number.
+            let of_light = 1.0 / (gain * NOISE_SIGMA * NOISE_SIGMA) as f32;
+            for (pixel, noise) in pixels.iter_mut().zip(&noise) {
+                *pixel += noise * (1.0 + of_light * pixel.max(0.0)).sqrt();
             }
         }
     }
+}
+
+// Whether a place from the middle is at most so far along both axes.
+fn is_within(offset: [f64; 2], reach: f64) -> bool {
+    offset.iter().all(|at| (-reach..reach).contains(at))
 }
 
 // At a place from the middle of the scene, in units of half the side.

@@ -167,14 +167,14 @@ fn versions_of_a_scene_have_the_same_noise() {
             settings.rotated = rotated;
         });
         let mut image = Array2::zeros((200, 200));
-        simulator.add_noise(4, &mut image);
+        simulator.add_noise(4, 1, &mut image);
         image
     };
     let first = noise(0.02, false);
     assert_eq!(first, noise(-0.02, false));
     assert_eq!(first, noise(0.02, true));
     let mut opposite = Array2::zeros((200, 200));
-    simulator(|settings| settings.negative_noise = true).add_noise(4, &mut opposite);
+    simulator(|settings| settings.negative_noise = true).add_noise(4, 1, &mut opposite);
     assert_eq!(first, -opposite);
 }
 
@@ -328,4 +328,59 @@ fn objects_are_behind_the_psf_of_their_place() {
         }
     }
     assert!(compared > 1, "{compared}");
+}
+
+#[test]
+fn an_epoch_is_the_scene_turned_and_moved() {
+    let simulator = simulator(|settings| {
+        settings.psf_shape = [0.0; 2];
+        settings.constant_shear = Some([0.05, 0.02]);
+        settings.epochs = 2;
+    });
+    let view = View {
+        radians: 0.5 * std::f64::consts::PI,
+        dither: [3.0, -7.0],
+    };
+    let mut scratch = RenderScratch::new();
+    let mut image = |view| {
+        let mut image = Array2::zeros((200, 200));
+        for source in sources(&simulator, 2) {
+            if let Some(own) = simulator.seen(&source, view) {
+                simulator.draw(&own, &mut scratch).add_to(&mut image);
+            }
+        }
+        image
+    };
+    let (plain, turned) = (image(View::default()), image(view));
+    let peak = largest(plain.iter().copied());
+    // From x to y: (x, y) → (199 − y + 3, x − 7).
+    let places = (10..190usize).flat_map(|y| (10..190usize).map(move |x| (x, y)));
+    let off = places.map(|(x, y)| turned[(x - 7, 202 - y)] - plain[(y, x)]);
+    let off = largest(off) / peak;
+    assert!(off < 1e-4, "{off}");
+    let settings = simulator.settings();
+    assert_eq!(settings.view(2, 1), View::default());
+    assert_ne!(settings.view(2, 2), settings.view(3, 2));
+}
+
+#[test]
+fn light_has_the_noise_of_its_electrons() {
+    let noise = |light: f32, gain| {
+        let simulator = simulator(|settings| settings.gain = gain);
+        let mut image = Array2::from_elem((200, 200), light);
+        simulator.add_noise(1, 1, &mut image);
+        image.mapv(|value| f64::from(value - light)).std(0.0)
+    };
+    // Of 40,000 numbers: 0.35 % is the error of one.
+    for (light, gain, sigma) in [
+        (30.0, Some(10.0), 2.0),
+        (-5.0, Some(10.0), 1.0),
+        (30.0, None, 1.0),
+    ] {
+        let found = noise(light, gain);
+        assert!(
+            (found / (sigma * NOISE_SIGMA) - 1.0).abs() < 0.015,
+            "{light}: {found}"
+        );
+    }
 }
