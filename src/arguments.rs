@@ -444,20 +444,10 @@ pub(super) struct SimulationArguments {
     #[arg(long, value_name = "SEED", default_value_t = SEED)]
     seed: u64,
     /// Factor on the simulated shear power spectrum.
-    #[arg(
-        long,
-        value_name = "A",
-        default_value_t = 1.0,
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "A", default_value_t = 1.0)]
     amplitude: f64,
     /// Extra slope of the simulated shear power spectrum, with its pivot at ℓ = 1000.
-    #[arg(
-        long,
-        value_name = "T",
-        default_value_t = 0.0,
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "T", default_value_t = 0.0)]
     tilt: f64,
     /// PSFs of sets whose PSFs are fixed (2, 5, 8, …): `field`, a field over the image that is the same in all images, as in
     /// GREAT10; `one`, one PSF of all galaxies, with which the data are half as large.

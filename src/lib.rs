@@ -45,13 +45,14 @@ mod paper {
     pub(crate) mod sets;
 }
 
+use std::any::TypeId;
 use std::ffi::OsString;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Parser, Subcommand};
+use clap::{Arg, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use arguments::StandardInput;
 use commands::{
@@ -240,7 +241,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
             return EXIT_FAILED;
         }
     };
-    let cli = match Cli::try_parse_from(read.arguments) {
+    let cli = match parsed(read.arguments) {
         Ok(cli) => cli,
         Err(message) => return usage(&with_separator(message)),
     };
@@ -291,10 +292,31 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     }
 }
 
+/// The program. Options of numbers take negative ones as values, so that the error is about the number.
+fn program() -> clap::Command {
+    fn with_numbers(command: clap::Command) -> clap::Command {
+        let is_number = |own: &Arg| own.get_value_parser().type_id() == TypeId::of::<f64>();
+        command
+            .mut_args(|own| match is_number(&own) {
+                true => own.allow_negative_numbers(true),
+                false => own,
+            })
+            .mut_subcommands(with_numbers)
+    }
+    with_numbers(Cli::command())
+}
+
+fn parsed<T: Into<OsString> + Clone>(
+    words: impl IntoIterator<Item = T>,
+) -> Result<Cli, clap::Error> {
+    let mut matches = program().try_get_matches_from(words)?;
+    Cli::from_arg_matches_mut(&mut matches)
+}
+
 // A command with its arguments, without the program's name.
 fn parse(command: &[String]) -> anyhow::Result<Command> {
     let words = std::iter::once("shearq").chain(command.iter().map(String::as_str));
-    let parsed = Cli::try_parse_from(words).map_err(|error| {
+    let parsed = self::parsed(words).map_err(|error| {
         let text = error.to_string();
         let text = text.strip_prefix("error: ").unwrap_or(&text);
         // Without the usage of the command.

@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use clap::{ArgAction, ArgMatches, CommandFactory};
+use clap::{ArgAction, ArgMatches};
 use serde_json::{Map, Value, json};
 use shearq_dataset::fingerprint;
 use shearq_files::FileError;
 use shearq_files::table::Place;
 use shearq_results::catalogues::Catalogues;
 
-use crate::{Cli, version_and_commit};
+use crate::{program, version_and_commit};
 
 // Settings of a folder of catalogues and of simulated data.
 const RECORDS: [&str; 2] = ["run.json", "simulation.json"];
@@ -87,7 +87,7 @@ pub(crate) fn account(catalogues: &Catalogues) -> Result<Vec<String>, FileError>
 
 // The options of a command with their defaults, by name. Flags that were not given are left out.
 fn settings(arguments: &[OsString]) -> Map<String, Value> {
-    let mut command = Cli::command();
+    let mut command = program();
     let Ok(matches) = command.try_get_matches_from_mut(arguments) else {
         return Map::new();
     };

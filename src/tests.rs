@@ -88,7 +88,7 @@ fn documented_commands_parse() {
     assert!(commands.len() > 20);
     for (page, line) in commands {
         let line = line.split(" #").next().unwrap_or(&line);
-        let parsed = Cli::try_parse_from(words(line));
+        let parsed = crate::parsed(words(line));
         assert!(parsed.is_ok(), "{page}: {line}: {}", parsed.unwrap_err());
     }
 }
@@ -107,7 +107,7 @@ fn every_command_has_examples_that_parse() {
             .collect();
         assert!(!examples.is_empty(), "{}: {help}", command.get_name());
         for example in examples {
-            let parsed = Cli::try_parse_from(words(example));
+            let parsed = crate::parsed(words(example));
             assert!(parsed.is_ok(), "{example}: {}", parsed.unwrap_err());
         }
     }

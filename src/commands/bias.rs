@@ -53,7 +53,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["Summing", "TableReading"])]
     merge: Vec<PathBuf>,
     /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
-    #[arg(long, value_name = "ERROR", value_parser = planned_error, allow_hyphen_values = true, exclusive = true)]
+    #[arg(long, value_name = "ERROR", value_parser = planned_error, exclusive = true)]
     plan: Option<f64>,
     /// Write example catalogues `plus.csv` and `minus.csv` into this folder: 20,000 galaxies with m1 = 0.01, m2 = -0.02,
     /// c1 = 0.001 and c2 = -0.0005.
@@ -85,22 +85,10 @@ struct Summing {
     #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "plot", "report"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
-    #[arg(
-        long,
-        value_name = "G1",
-        allow_hyphen_values = true,
-        requires = "g2",
-        conflicts_with = "truth"
-    )]
+    #[arg(long, value_name = "G1", requires = "g2", conflicts_with = "truth")]
     g1: Option<f64>,
     /// True g2 of all catalogues.
-    #[arg(
-        long,
-        value_name = "G2",
-        allow_hyphen_values = true,
-        requires = "g1",
-        conflicts_with = "truth"
-    )]
+    #[arg(long, value_name = "G2", requires = "g1", conflicts_with = "truth")]
     g2: Option<f64>,
     /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 or x, y, g1, g2 (within 1 pixel) [default: columns
     /// g1 and g2 of the catalogues, or the true shear of the data of a folder].

@@ -21,7 +21,6 @@ use shearq_render::escape::line;
 use shearq_render::table::TableFormat;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
 use shearq_results::submit::{Sent, Submission};
-use shearq_simulate::scene::SceneSimulator;
 
 use super::check::report;
 use super::simulate::{OTHER_DATA, SceneArguments, fits_of};
@@ -87,20 +86,10 @@ struct NewArguments {
     #[arg(long, value_name = "N", conflicts_with = "data", value_parser = clap::value_parser!(u16).range(8..=400))]
     grid: Option<u16>,
     /// Factor on the simulated shear power spectrum [default: drawn from 0.5 to 2, and secret].
-    #[arg(
-        long,
-        value_name = "A",
-        conflicts_with = "data",
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "A", conflicts_with = "data")]
     amplitude: Option<f64>,
     /// Extra slope of the simulated shear power spectrum [default: drawn from -0.2 to 0.2, and secret].
-    #[arg(
-        long,
-        value_name = "T",
-        conflicts_with = "data",
-        allow_hyphen_values = true
-    )]
+    #[arg(long, value_name = "T", conflicts_with = "data")]
     tilt: Option<f64>,
     /// Data folder with images and PSFs of another simulator. Pixels are copied under new headers.
     #[arg(long, value_name = "DIR")]
@@ -114,7 +103,7 @@ struct NewArguments {
     #[arg(long, value_name = "FILE", requires = "scenes", conflicts_with = OTHER_DATA)]
     galaxies: Option<PathBuf>,
     /// Largest |m| of ranked entries of scenes, to which twice its error is added [default: 0.02].
-    #[arg(long, value_name = "M", requires = "scenes", conflicts_with = OTHER_DATA, value_parser = positive)]
+    #[arg(long, value_name = "M", requires = "scenes", conflicts_with = OTHER_DATA, value_parser = max_m)]
     max_m: Option<f64>,
     /// Metric that ranks entries [default: q-calibrated, or qc if each set has one shear].
     ///
@@ -150,6 +139,14 @@ struct NewArguments {
     data_version: u32,
     #[command(flatten)]
     threads: Threads,
+}
+
+// Above it, the limit is one for nothing.
+const LARGEST_MAX_M: f64 = 0.5;
+
+fn max_m(text: &str) -> Result<f64, String> {
+    let found = positive(text).ok().filter(|own| *own <= LARGEST_MAX_M);
+    found.ok_or_else(|| format!("expected a positive number up to {LARGEST_MAX_M}"))
 }
 
 // Options without a meaning for scenes, whose entries have one metric.
@@ -345,9 +342,8 @@ fn new_scenes(
     count: u32,
 ) -> anyhow::Result<()> {
     let (fits, galaxies) = fits_of(arguments.galaxies.as_deref())?;
-    // The seed is drawn later, and objects do not depend on it.
+    // The seed is drawn later.
     let settings = arguments.scene.settings(0);
-    let objects = SceneSimulator::new(settings, fits.clone())?.objects();
     let area = settings.area_arcmin2();
     let error = expected_m_error(f64::from(count) * area);
     let scenes = Scenes {
@@ -356,10 +352,10 @@ fn new_scenes(
         fits,
         galaxies,
     };
-    let mut bar = Bar::new("simulating", u64::from(count) * objects as u64);
     let threads = arguments.threads.number();
-    of_scenes(plan, &scenes, folders, threads, &mut bar)?;
-    drop(bar);
+    of_scenes(plan, &scenes, folders, threads, |objects| {
+        Box::new(Bar::new("simulating", objects))
+    })?;
     tell(format_args!(
         "wrote {} of {area:.2} arcmin², which determine m to about {error:.3}, to {}; keep {} secret",
         crate::count(count as usize, "scene"),

@@ -289,10 +289,18 @@ fn options_of_other_kinds_are_refused() {
     );
     folder.refuses(
         &new("--kind scenes --scenes 100000"),
-        "--scenes: found 100000, expected at most",
+        "--scenes: found 100000, expected 3 to",
     );
     folder.refuses(
         &new("--kind scenes --scenes 2"),
-        "constant shears need at least 3 sets",
+        "--scenes: found 2, expected 3 to",
+    );
+    folder.refuses(
+        &new("--kind scenes --scenes 3 --density 0"),
+        "--density: found 0 galaxies",
+    );
+    folder.refuses(
+        &new("--kind scenes --scenes 3 --max-m 5"),
+        "expected a positive number up to 0.5",
     );
 }

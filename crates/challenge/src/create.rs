@@ -24,7 +24,7 @@ use shearq_simulate::scene::{SceneSettings, SceneSimulator};
 use shearq_simulate::set::{FixedPsf, STAMP, SimulationSettings};
 
 use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
-use crate::kind::{ConstantShears, Kind, Noise, RankBy, additive_bias, response};
+use crate::kind::{ConstantShears, Kind, MIN_SCENES, Noise, RankBy, additive_bias, response};
 use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
@@ -217,7 +217,8 @@ pub fn simulated(
     finish(plan, rankable, data, folders, key, threads)
 }
 
-/// Writes a challenge of scenes with a shear each. The same command resumes a stopped one. Returns the description.
+/// Writes a challenge of scenes with a shear each. The same command resumes a stopped one. Progress is in objects. Returns the
+/// description.
 ///
 /// There is one version of each scene: participants would find the shear from two under opposite shears, or from one that is
 /// turned, because shapes cancel in their mean, and from one with the opposite noise.
@@ -226,13 +227,16 @@ pub fn of_scenes(
     scenes: &Scenes,
     folders: Folders<'_>,
     threads: usize,
-    progress: &mut dyn Progress,
+    start: impl FnOnce(u64) -> Box<dyn Progress>,
 ) -> Result<Challenge, ChallengeError> {
     if plan.kind != Kind::Scenes {
         return Err(ChallengeError::ScenesOfKind(plan.kind));
     }
-    if scenes.count > MAX_SET {
-        return Err(ChallengeError::ManyScenes(scenes.count));
+    if !(MIN_SCENES..=MAX_SET).contains(&scenes.count) {
+        return Err(ChallengeError::SceneCount(scenes.count));
+    }
+    if scenes.settings.density == 0.0 {
+        return Err(ChallengeError::NoGalaxies);
     }
     plan.check()?;
     let (seed, key) = seeded(plan, folders.prepare(plan)?);
@@ -258,6 +262,9 @@ pub fn of_scenes(
         images: folders.public,
         truth: folders.private,
     };
+    let exposures = u64::from(scenes.count * settings.epochs);
+    let mut progress = start(exposures * simulator.objects() as u64);
+    let progress = progress.as_mut();
     simulate_scenes(&simulator, &record, scenes.count, apart, threads, progress)?;
     let version = [(&simulator, folders.private)];
     write_shears(version.into_iter(), scenes.count, folders.private)?;

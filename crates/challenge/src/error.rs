@@ -9,7 +9,7 @@ use shearq_results::score::ScoreError;
 use shearq_scoring::ScoringError;
 use thiserror::Error;
 
-use crate::kind::Kind;
+use crate::kind::{Kind, MIN_SCENES};
 use crate::terms::Deadline;
 
 // Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
@@ -41,8 +41,12 @@ pub enum ChallengeError {
     NoScenes,
     #[error("--scenes is of another kind of challenge (found --kind {}){}", .0.name(), tried(self.hint()))]
     ScenesOfKind(Kind),
-    #[error("--scenes: found {0}, expected at most {MAX_SET}")]
-    ManyScenes(u32),
+    #[error("--scenes: found {0}, expected {MIN_SCENES} to {MAX_SET}")]
+    SceneCount(u32),
+    #[error(
+        "--density: found 0 galaxies per arcmin² (expected a positive number): there is nothing to measure"
+    )]
+    NoGalaxies,
     #[error(
         "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
     )]

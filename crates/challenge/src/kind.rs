@@ -239,6 +239,9 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
 // Published values determine the truth entry by entry (docs/run-a-challenge.md).
 pub const ENTRIES_PER_TEAM: u32 = 10;
 
+// A line through two shears has no error.
+pub(crate) const MIN_SCENES: u32 = 3;
+
 /// Largest |m| of ranked entries of scenes, unless the organiser chooses another number.
 // That of sep without a cut (docs/scenes.md): a challenge of some hundred scenes determines m to 0.02, and cannot require less.
 pub const MAX_M: f64 = 0.02;

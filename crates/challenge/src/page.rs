@@ -141,15 +141,25 @@ impl View<'_> {
             if is_secret || other == metric || !other.suits(self.constant.is_some()) {
                 continue;
             }
-            add(key(other).0, other.label(), Cell::Empty, &|standing| {
+            let of = |standing: &Standing<'_>| {
                 let entry = standing.best.entry;
-                match entry.value(other, self.constant).0 {
-                    of if of.is_finite() => {
-                        exact(of, entry.published(other, self.constant, self.noise))
-                    }
-                    _ => Cell::Empty,
-                }
+                let (value, error) = entry.value(other, self.constant);
+                let own = entry.published(other, self.constant, self.noise);
+                value.is_finite().then_some((value, error, own))
+            };
+            let (of_value, of_error) = key(other);
+            add(of_value, other.label(), Cell::Empty, &|standing| {
+                of(standing).map_or(Cell::Empty, |(value, _, own)| exact(value, own))
             });
+            // A limit of m is compared with it.
+            if self.challenge.data.scene.is_some() {
+                add(of_error, "±", Cell::Empty, &|standing| {
+                    of(standing).map_or(Cell::Empty, |(_, error, own)| match self.detail {
+                        true => Cell::number(error, own.decimals + 2),
+                        false => Cell::number(own.step, own.decimals),
+                    })
+                });
+            }
         }
         if self.challenge.data.scene.is_some() {
             add("density", "rows/arcmin²", Cell::Empty, &|standing| {

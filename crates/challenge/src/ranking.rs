@@ -81,7 +81,7 @@ type Teams<'a> = BTreeMap<(Board, bool, &'a str), Vec<Scored<'a>>>;
 
 /// Why an entry that was compared with the true shear has no rank, in the words for its team: what the comparison showed depends
 /// on the truth.
-pub const UNSCORED: &str = "no score after the comparison with the true shear. Try: shearq challenge check before the next entry";
+pub const UNSCORED: &str = "no score after the comparison with the true shear. Try: shearq challenge check, and the signs and components of a simulation with known shear";
 
 /// Ranks entries, which are in order of arrival. On each board, a team has the rank of its best entry. A team shares the
 /// rank of a better team if the difference of both is below its error, or if both values are printed alike. `constant` has the

@@ -253,9 +253,17 @@ pub fn check(sent: &Sent, scenes: &[u32]) -> Result<(Vec<String>, Option<String>
     Ok((about.columns.clone(), about.undivided.clone()))
 }
 
-/// A text about the catalogues of an entry, without the folder that it was unpacked to.
+// Options of `bias` in hints, and what stands for them in an entry.
+const IN_ENTRIES: [(&str, &str); 2] = [
+    ("--columns ", "names of columns as by `bias --columns`, "),
+    ("--drop-missing", "catalogues without such rows"),
+];
+
+/// A text about the catalogues of an entry, without the folder that it was unpacked to and the options of `bias`.
 pub fn shortened(text: &str, sent: &Sent) -> String {
-    text.replace(&format!("{}/", sent.path().display()), "")
+    let text = text.replace(&format!("{}/", sent.path().display()), "");
+    let replaced = |text: String, (option, words): &(&str, &str)| text.replace(option, words);
+    IN_ENTRIES.iter().fold(text, replaced)
 }
 
 /// The true shears of the scenes in a private folder.

@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use ndarray::Array2;
-use shearq_files::FileError;
 use shearq_files::fits::{self, TableHead};
 use shearq_files::table::Place;
+use shearq_files::{FileError, names_of};
 
 // Interpreter that has the Python package, if it is not the `python3` of the path. The package sets it for its own command line.
 const PYTHON: &str = "SHEARQ_PYTHON";
@@ -48,14 +48,13 @@ impl PsfModel {
             _ => None,
         };
         let Some(table) = table else {
+            let numbers: Vec<String> = of_psfex.iter().map(|own| own.number.to_string()).collect();
             let message = format!(
-                "found {} models of PSFEx for {} exposures; expected one, or one for each",
-                of_psfex.len(),
-                chip.of
+                "found models of PSFEx in table {}; expected one that is named, or one for each exposure",
+                names_of(&numbers)
             );
-            return Err(
-                FileError::new(&place.path, message).hint(format!("{}[2]", place.path.display()))
-            );
+            let first = format!("{}[{}]", place.path.display(), numbers[0]);
+            return Err(FileError::new(&place.path, message).hint(first));
         };
         let model = PsfexModel::read(&place.path, table.number)?;
         Ok(Some(PsfModel::Psfex(Box::new(model))))
@@ -207,6 +206,12 @@ impl PsfexModel {
             let message = format!("sides of {terms} masks with {} numbers", basis.len());
             return Err(expected("PSFAXIS1", &message));
         }
+        if !["", &terms.to_string()].contains(&text("PSFAXIS3")) {
+            return Err(expected(
+                "PSFAXIS3",
+                &format!("{terms} masks of a polynomial of degree {degree}"),
+            ));
+        }
         let of_place = |key: &str| if varies { number(key) } else { Ok(1.0) };
         let model = PsfexModel {
             basis,
@@ -271,8 +276,8 @@ impl PsfexModel {
         let mask = self.mask_at(place);
         let [columns, rows] = self.sides;
         let light: f64 = mask.iter().sum::<f64>() * self.step * self.step;
-        // A polynomial may be negative far from its stars. A PSF that is divided by this would look like one.
-        let light = if light > 0.0 { light } else { f64::NAN };
+        // A polynomial may be negative far from its stars. Divided by this, a PSF would look like one.
+        let light = light.abs();
         // Along x first.
         let mut lines = vec![0.0; side * rows];
         for (line, row) in lines.chunks_exact_mut(side).zip(mask.chunks_exact(columns)) {

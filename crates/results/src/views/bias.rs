@@ -336,7 +336,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         };
         let k = own.component + 1;
         lines.push(format!(
-            "row {} of {} has {:.1} % of the sum of the response R{k}{k} (found {}, expected about {:.3}), and changes m{k} by about as much{more}. Try: check its measurement, or flag it",
+            "row {} of {} has {:.1} % of the sum of the response R{k}{k} (found {}, expected about {:.3}), and changes m{k} by about as much{more}. Try: look at it, and flag it only if its measurement failed",
             own.row,
             catalogue.name,
             100.0 * own.share,
@@ -360,7 +360,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
     }
     let units = match &result.about.unit_column {
         Some(column) => format!("--units {column}"),
-        None => "--columns id=NAME with identifiers, or --units COLUMN".into(),
+        None => "--columns id=NAME with identifiers, --units COLUMN, or --units catalogues for detections".into(),
     };
     // Without shape noise, only pixel noise cancels: errors of m were 54 times too large.
     let wrong = "the error of m is too large by the ratio of total scatter to measurement noise, and that of c too small by up to √2";
