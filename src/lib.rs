@@ -292,13 +292,13 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     }
 }
 
-/// The program. Options of numbers take negative ones as values, so that the error is about the number.
+/// The program. Options of numbers take negative ones as values, such as -.02, so that an error is about the number.
 fn program() -> clap::Command {
     fn with_numbers(command: clap::Command) -> clap::Command {
         let is_number = |own: &Arg| own.get_value_parser().type_id() == TypeId::of::<f64>();
         command
             .mut_args(|own| match is_number(&own) {
-                true => own.allow_negative_numbers(true),
+                true => own.allow_hyphen_values(true),
                 false => own,
             })
             .mut_subcommands(with_numbers)

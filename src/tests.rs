@@ -1,6 +1,6 @@
 //! The options that go together, and the commands of the documents.
 
-use clap::{Arg, Command, CommandFactory, Parser};
+use clap::{Arg, Command, CommandFactory};
 
 use crate::{Cli, causes};
 
@@ -90,6 +90,20 @@ fn documented_commands_parse() {
         let line = line.split(" #").next().unwrap_or(&line);
         let parsed = crate::parsed(words(line));
         assert!(parsed.is_ok(), "{page}: {line}: {}", parsed.unwrap_err());
+    }
+}
+
+#[test]
+fn negative_and_large_numbers_reach_their_checks() {
+    for (line, expected) in [
+        ("shearq bias --area -3 a.csv", "expected a positive number"),
+        (
+            "shearq challenge new --name a --kind scenes --scenes 3 --max-m 5 --public b --private c",
+            "expected a positive number up to 0.5",
+        ),
+    ] {
+        let error = crate::parsed(words(line)).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
     }
 }
 

@@ -13,7 +13,7 @@ use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::catalogues::sent_galaxies;
-use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
+use shearq_results::submit::check::{Expected, ExpectedImages, Finding, Severity, check_sent};
 use shearq_results::submit::{Kind, Sent};
 
 /// Check a submission before you send it.
@@ -107,12 +107,28 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             truth.insert(set, data.read_truth(set, &grid)?);
         }
     }
+    let images = match (arguments.images, &data) {
+        (Some(count), _) => ExpectedImages::Each(count),
+        (None, Some(data)) => {
+            let images = data.images(&[])?;
+            let numbers = |set| {
+                images
+                    .of_set(set)
+                    .into_iter()
+                    .map(|(image, _)| image)
+                    .collect()
+            };
+            let sets = images.sets().into_iter();
+            ExpectedImages::OfSets(sets.map(|set| (set, numbers(set))).collect())
+        }
+        (None, None) => ExpectedImages::Unknown,
+    };
     let expected = Expected {
         grid,
         definition: Definition::Leaderboard,
         truth,
         secret_truth: BTreeMap::new(),
-        images: arguments.images,
+        images,
         sets: Vec::new(),
         partial: false,
     };

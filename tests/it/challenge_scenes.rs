@@ -299,8 +299,4 @@ fn options_of_other_kinds_are_refused() {
         &new("--kind scenes --scenes 3 --density 0"),
         "--density: found 0 galaxies",
     );
-    folder.refuses(
-        &new("--kind scenes --scenes 3 --max-m 5"),
-        "expected a positive number up to 0.5",
-    );
 }

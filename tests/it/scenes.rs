@@ -136,12 +136,10 @@ fn epochs_of_a_scene_have_the_same_sky() {
     assert_has(&folder.said(&simulate), "1 exposures of");
     assert!(whole == contents(&folder.at("scene")));
     folder.run("gather --exposure scene/scene-001.fits scene/scene-001-epoch-2.fits --psf scene/psf.fits scene/psf.fits --positions scene/truth-001.csv --degrees --frame sky --out stamps");
-    folder.run(
-        "measure --submission 48/linear/star --data stamps --catalogue-format csv --out shapes",
-    );
+    folder.run("measure --submission 48/linear/star --data stamps --out shapes");
     let [first, second] = [1, 2].map(|epoch| {
-        let path = folder.at(&format!("shapes/set01/catalogue-00{epoch}.csv"));
-        csv(&path, &["e1", "e2"])
+        let path = format!("shapes/set01/catalogue-00{epoch}.parquet");
+        folder.numbers(&path, ["e1", "e2"])
     });
     // Shapes have a scatter of 0.2, noise of S/N 300 one of 0.004.
     let off = first.iter().flatten().zip(second.iter().flatten());

@@ -90,37 +90,46 @@ class Detection:
         weight = np.broadcast_to(weight, (self.side, weight.size)).ravel()
         return ((left * weight) @ right.conj().T).real / self.side**2
 
-    def sums(self, image):
-        """Sums over the pixels of an image: f, its correction for the PSF's shape, response, and w."""
+    def filtered(self, transform, own):
+        return np.fft.irfft2(transform * own, s=(self.side, self.side))
+
+    def changes(self, image, place):
+        """Changes of all functionals with both components of shear, at places."""
         transform = np.fft.rfft2(image)
+        return [np.array([self.filtered(transform, own[k])[place] for own in self.filters]) for k in (1, 2)]
 
-        def filtered(own):
-            return np.fft.irfft2(transform * own, s=(self.side, self.side))
-
-        maps = [filtered(own[0]) for own in self.filters[:STEPS]]
+    def candidates(self, image):
+        """Of the pixels of an image that may have a weight: sums of f, derivatives of f by functionals, and sums of the response's noise
+        and of the correction for the PSF's shape, by component; changes of the functionals; and places. The sum of w is the last."""
+        transform = np.fft.rfft2(image)
+        maps = [self.filtered(transform, own[0]) for own in self.filters[:STEPS]]
         is_candidate = maps[0] > self.threshold - self.half_widths[0]
         for values, half_width in zip(maps[1:], self.half_widths[1:]):
             is_candidate &= values > -(half_width + SHARE * np.maximum(maps[0], 0))
         place = np.nonzero(is_candidate)
-        u = np.array([own[place] for own in maps] + [filtered(own[0])[place] for own in self.filters[STEPS:]])
-        changes = [np.array([filtered(own[k])[place] for own in self.filters]) for k in (1, 2)]
+        u = np.array([own[place] for own in maps] + [self.filtered(transform, own[0])[place] for own in self.filters[STEPS:]])
         w, gradient, hessian = self.weight(u)
-        total = np.zeros(7)
+        f, slopes, noise, of_psf = [], [], [], []
         divisor = u[5] + SOFTENING * self.deviation[5]
-        for k, change in enumerate(changes):
+        for k in range(2):
             moment = u[6 + k]
             e = moment / divisor
             of_e, of_e_twice = np.zeros_like(u), np.zeros((FUNCTIONALS, *u.shape))
             of_e[6 + k], of_e[5] = 1 / divisor, -moment / divisor**2
             of_e_twice[5, 5] = 2 * moment / divisor**3
             of_e_twice[5, 6 + k] = of_e_twice[6 + k, 5] = -1 / divisor**2
-            first = gradient * e + w * of_e
             second = hessian * e + w * of_e_twice + gradient[:, None] * of_e[None] + of_e[:, None] * gradient[None]
-            total[k] = (w * e).sum()
-            total[2 + k] = np.einsum("abn,ab->", second, self.psf_shape)
-            total[4 + k] = (first * change).sum() - np.einsum("abn,ab->", second, self.of_shear[k])
-        total[6] = w.sum()
-        return total
+            f.append((w * e).sum())
+            slopes.append(gradient * e + w * of_e)
+            noise.append(np.einsum("abn,ab->", second, self.of_shear[k]))
+            of_psf.append(np.einsum("abn,ab->", second, self.psf_shape))
+        return (f, slopes, noise), self.changes(image, place), place, of_psf, w.sum()
+
+    def sums(self, image):
+        """Sums over the pixels of an image: f, its correction for the PSF's shape, response, and w."""
+        (f, slopes, noise), changes, _, of_psf, weight = self.candidates(image)
+        response = [(slopes[k] * changes[k]).sum() - noise[k] for k in range(2)]
+        return np.array([*f, *of_psf, *response, weight])
 
     def weight(self, u):
         """w of the functionals, its gradient and its second derivatives."""

@@ -98,6 +98,14 @@ impl Estimate {
         value.is_finite().then_some(Measured { value, error })
     }
 
+    /// Error of a shear component from 1 arcmin², of both components in quadrature: σ(c)·√A, of units that have the `area` each in
+    /// arcmin². It contains the factor 1 + m of the measured shears.
+    pub fn shear_error(&self, area: f64) -> Option<f64> {
+        let of = |key| self.value(key).map(|c| c.error);
+        let squares = of("c1")?.powi(2) + of("c2")?.powi(2);
+        Some((0.5 * squares * area * self.units as f64).sqrt())
+    }
+
     /// Covariance of m1 and m2; `None` if the data do not determine both.
     pub fn covariance(&self) -> Option<f64> {
         // Of the variances of m1, m2 and (m1 + m2)/2, which contain the noise of stars, too.

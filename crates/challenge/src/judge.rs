@@ -618,6 +618,10 @@ impl Judge {
             Ok(score) => {
                 let (m, error) = score.m;
                 verdict.findings.extend(no_response(1.0 + m, error));
+                if !score.value(self.challenge.rules.metric).0.is_finite() {
+                    let message = "the shear error cannot be computed (expected a finite scatter)";
+                    verdict.findings.push(message.into());
+                }
                 verdict.scored = verdict.findings.is_empty();
                 info.scenes = Some(score);
             }

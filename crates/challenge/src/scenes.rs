@@ -19,7 +19,6 @@ use shearq_quantities::{hints, tried};
 use shearq_results::bias::{BiasFailure, Summed, sum};
 use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::{MANIFEST_FILE, Sent};
-use shearq_results::views::per_area::shear_error;
 use thiserror::Error;
 
 use crate::kind::{Measured, RankBy};
@@ -53,7 +52,7 @@ impl SceneScore {
         let response = 1.0 + m.0;
         let c = c1.0.hypot(c2.0);
         let c_error = (c1.0 * c1.1).hypot(c2.0 * c2.1) / c;
-        let scatter = shear_error(all, area).unwrap_or(f64::NAN) / response;
+        let scatter = all.shear_error(area).unwrap_or(f64::NAN) / response;
         // Of a standard deviation with ν degrees of freedom: 1/√(2ν). Two lines have two parameters each.
         let freedom = 2.0 * (all.units as f64 - 2.0);
         let relative = (0.5 / freedom).sqrt().hypot(m.1 / response);

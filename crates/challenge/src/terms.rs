@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_results::submit::check::Expected;
+use shearq_results::submit::check::{Expected, ExpectedImages};
 use shearq_results::submit::{Contents, Packed, Sent, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
@@ -215,7 +215,7 @@ impl Challenge {
             definition: self.rules.metric.definition(),
             truth: BTreeMap::new(),
             secret_truth: BTreeMap::new(),
-            images: Some(*images),
+            images: ExpectedImages::Each(*images),
             sets: sets.clone(),
             partial: self.rules.partial,
         })

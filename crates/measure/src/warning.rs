@@ -632,7 +632,7 @@ impl Warning {
         Self::Empty { .. } => "check that the positions are those of galaxies on this image",
         Self::Saturated { .. } | Self::FlatTops { .. } => "replace saturated pixels by NaN",
         Self::NearSaturation { .. } => "an image that is corrected for non-linearity, or such pixels as NaN",
-        Self::PoissonNoise { gain, .. } => &format!("gather --gain {gain}, if this is the gain of the pixels"),
+        Self::PoissonNoise { gain, .. } => &format!("gather into a new folder with --gain {gain}, if this is the gain of the pixels"),
         Self::PeakNormalised { .. } => "stamps in one unit",
         Self::Clipped { .. } => "images whose negative pixels are kept",
         Self::PsfTruncated { .. } => "a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",

@@ -9,7 +9,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
-use shearq_files::table::{self, MAX_ROWS, Place, most_rows};
+use shearq_files::table::{self, FileFormat, MAX_ROWS, Place, most_rows};
 use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
@@ -39,8 +39,8 @@ pub fn read_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
 /// The convention of catalogues by shearq, which is the standard one by construction.
 pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 
-/// The number of the set of plain files, which have none.
-pub const PLAIN_SET: u32 = 0;
+/// The number of the set of plain files, which have none: sets of data folders may be 0.
+pub const PLAIN_SET: u32 = u32::MAX;
 
 #[derive(Debug)]
 pub struct Catalogues {
@@ -100,9 +100,13 @@ impl Catalogues {
         let images = (1..).zip(paths.iter().cloned()).collect();
         let files = Files::from_sets(BTreeMap::from([(PLAIN_SET, images)]));
         let first = paths.first().map_or(Path::new(""), PathBuf::as_path);
-        let is_own = described.is_none() && states_shearq(first)? == Some(true);
+        let mut is_own = described.is_none();
+        for path in paths {
+            is_own = is_own && states_shearq(path)? == Some(true);
+        }
         Ok(Catalogues {
             description: (!is_own).then(|| described.unwrap_or_default()),
+            by_shearq: is_own,
             ..Self::of_files(String::new(), first, String::new(), files)
         })
     }
@@ -139,9 +143,11 @@ impl Catalogues {
     /// shear is in one frame.
     pub fn frame(&self, set: u32) -> Result<Frame, FileError> {
         let mut axes = CommonAxes::default();
-        if let Some(run) = &self.run {
-            for (_, path) in self.files.of_set(set) {
-                axes.add(&path, stated_axes(&path, run.format)?, true)?;
+        let is_measured = self.by_shearq && self.sent.is_none();
+        for (_, path) in self.files.of_set(set).iter().filter(|_| is_measured) {
+            let format = self.run.as_ref().map(|run| run.format);
+            if let Some(format) = format.or_else(|| FileFormat::of(path)) {
+                axes.add(path, stated_axes(path, format)?, true)?;
             }
         }
         Ok(axes.common().map_or(Frame::Pixel, Axes::frame))

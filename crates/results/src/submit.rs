@@ -78,7 +78,7 @@ impl Kind {
 
 fn number(text: &str, most: u32) -> Option<u32> {
     // A leading zero would give one image two names.
-    if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
+    if (text.starts_with('0') && text != "0") || !text.bytes().all(|b| b.is_ascii_digit()) {
         return None;
     }
     text.parse().ok().filter(|number| *number <= most)

@@ -513,7 +513,7 @@ fn no_sky<T>(path: &Path, exposure: &Path, wcs: &Wcs) -> Result<T, FileError> {
     let found = match wcs.fault() {
         Some(fault) => format!("{}: {fault}", exposure.display()),
         None => format!(
-            "the header of {} has no WCS (expected TAN, TAN-SIP, TPV, SIN or STG)",
+            "the header of {} has no WCS (expected TAN, TAN-SIP, TPV, SIN, STG or CAR)",
             exposure.display()
         ),
     };

@@ -779,10 +779,22 @@ impl Galaxies {
             || other.sky.as_ref().map_or(0, |[ra, _]| ra.len()),
             Vec::len,
         );
-        let mut known = vec![false; count];
-        found.iter().flatten().for_each(|row| known[*row] = true);
-        let missing = known.iter().filter(|known| !**known).count();
-        if let Some(row) = known.iter().position(|known| !known) {
+        // Of each row, the galaxy that it is.
+        let mut known: Vec<Option<usize>> = vec![None; count];
+        for (galaxy, row) in found.iter().enumerate() {
+            let Some(row) = *row else { continue };
+            if let Some(earlier) = known[row].replace(galaxy) {
+                let message = format!(
+                    "rows {} and {} of image {} are one galaxy here (expected each galaxy once)",
+                    earlier + 1,
+                    galaxy + 1,
+                    first.image
+                );
+                return Err(fault(message).hint("positions without repeated galaxies"));
+            }
+        }
+        let missing = known.iter().filter(|known| known.is_none()).count();
+        if let Some(row) = known.iter().position(Option::is_none) {
             let name = match (&other.ids, &other.sky) {
                 (Some(ids), _) => format!("id {}", ids[row]),
                 (None, Some([ra, dec])) => format!("ra {}, dec {}", ra[row], dec[row]),
@@ -915,6 +927,11 @@ mod tests {
                 "joined by the columns id, or ra and dec",
             ),
             (&alone, twice, "two galaxies are within 0.5″"),
+            (
+                &galaxies(Some(&["7", "8", "7"]), &[]),
+                of(&["7", "8"], &[]),
+                "rows 1 and 3 of image 1 are one galaxy here",
+            ),
         ] {
             let text = find(first, &other).unwrap_err();
             assert!(text.contains(words), "{text}");

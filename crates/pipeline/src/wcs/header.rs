@@ -406,7 +406,10 @@ impl Wcs {
                     matrix,
                     projection: Projection::Plane,
                 }),
-                unread: named.then(|| kind.to_owned()),
+                unread: named.then(|| match kind {
+                    "CAR" if equatorial => format!("{kind} with a turned north"),
+                    _ => kind.to_owned(),
+                }),
                 // Of projections that are not read, none is.
                 doubts: match named {
                     true => Vec::new(),

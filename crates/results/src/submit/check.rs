@@ -38,6 +38,18 @@ pub struct Finding {
     pub message: String,
 }
 
+/// Which images a set must have.
+#[derive(Debug, Clone, Default)]
+pub enum ExpectedImages {
+    /// Those up to the last one that was sent.
+    #[default]
+    Unknown,
+    /// So many.
+    Each(u32),
+    /// These numbers of each set, and of others those up to the last one that was sent.
+    OfSets(BTreeMap<u32, Vec<u32>>),
+}
+
 #[derive(Debug, Clone)]
 pub struct Expected {
     pub grid: Grid,
@@ -47,7 +59,7 @@ pub struct Expected {
     pub truth: BTreeMap<u32, TrueShear>,
     /// True shear that findings must not reveal: only images that do not follow it as the others do are told, to `done`.
     pub secret_truth: BTreeMap<u32, TrueShear>,
-    pub images: Option<u32>,
+    pub images: ExpectedImages,
     /// Sets that a submission must contain; it must contain no other sets. Empty if unknown.
     pub sets: Vec<u32>,
     /// Whether `sets` may be absent, with a warning.
@@ -164,7 +176,7 @@ fn check_files(
         check_sets(path, &found, expected, report);
     }
     let numbers = catalogues.values().flatten().map(|(image, _)| *image);
-    let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
+    let most = numbers.max().unwrap_or(0);
     for (set, mut of_set) in catalogues {
         // In the order in which `score` adds them, whose groups of the jackknife depend on it.
         of_set.sort_by_key(|(image, _)| *image);
@@ -530,37 +542,48 @@ fn name_of(path: &Path) -> String {
         .into_owned()
 }
 
+// `most` is the largest number of all sets.
 fn check_images(
     set: u32,
     files: &SentImages<'_>,
-    last: u32,
+    most: u32,
     path: &Path,
     expected: &Expected,
     report: &mut Report,
 ) {
-    let missing: Vec<String> = (1..=last)
-        .filter(|image| files.numbers.binary_search(image).is_err())
-        .map(|image| image.to_string())
-        .collect();
+    let last = files.numbers.last().copied().unwrap_or(0);
+    let known = match &expected.images {
+        ExpectedImages::Unknown => None,
+        ExpectedImages::Each(count) => Some((1..=*count).collect()),
+        ExpectedImages::OfSets(sets) => sets.get(&set).cloned(),
+    };
+    let is_known = known.is_some();
+    let wanted: Vec<u32> = known.unwrap_or_else(|| (1..=last).collect());
+    let listed = |from: &[u32], there: &[u32]| -> Vec<String> {
+        let other = from.iter().filter(|image| !there.contains(image));
+        other.map(u32::to_string).collect()
+    };
+    let missing = listed(&wanted, &files.numbers);
     if !missing.is_empty() {
-        let shown = missing
-            .iter()
-            .take(10)
-            .cloned()
-            .collect::<Vec<_>>()
-            .join(", ");
-        let more = if missing.len() > 10 { ", …" } else { "" };
         let message = format!(
-            "set {set} lacks {} of {last} images: {shown}{more}",
-            missing.len()
+            "set {set} lacks {} of {} images: {}{}",
+            missing.len(),
+            wanted.len(),
+            missing[..missing.len().min(10)].join(", "),
+            if missing.len() > 10 { ", …" } else { "" }
         );
         report.error(path, "images", message);
     }
-    let last = files.numbers.last().copied().unwrap_or(0);
-    if let Some(images) = expected.images.filter(|images| last > *images) {
+    let more = listed(&files.numbers, &wanted);
+    if let Some(image) = more.last() {
+        let count = wanted.len();
         let message =
-            format!("set {set}: too many images (found image {last}, expected {images} images)");
+            format!("set {set}: too many images (found image {image}, expected {count} images)");
         report.error(path, "images", message);
+    }
+    if !is_known && last < most {
+        let message = format!("set {set} has {last} images, and another set {most}");
+        report.add(path, Severity::Warning, "images", message);
     }
 }
 

@@ -1,6 +1,5 @@
 //! What a pipeline with detection makes of an area of sky: a cut that lowers m may cost more galaxies than it is worth.
 
-use shearq_bias::Estimate;
 use shearq_render::table::{Cell, Heading, Table};
 
 use crate::bias::BiasResult;
@@ -10,14 +9,6 @@ const SHAPE_NOISE: f64 = 0.26;
 
 // Ratio of the effective number and that of detections above which shapes cancel. The error of 24 units is itself known to 14 %.
 const MAX_EFFECTIVE: f64 = 1.3;
-
-/// Error of a shear component from 1 arcmin², of both components in quadrature: σ(c)·√A, of units that have the `area` each. It
-/// contains the factor 1 + m of the measured shears.
-pub fn shear_error(all: &Estimate, area: f64) -> Option<f64> {
-    let of = |key| all.value(key).map(|c| c.error);
-    let squares = of("c1")?.powi(2) + of("c2")?.powi(2);
-    Some((0.5 * squares * area * all.units as f64).sqrt())
-}
 
 /// Adds columns to a table of bias: detections per arcmin², the error of a shear component from 1 arcmin², and the effective number.
 /// Each catalogue is of `area` arcmin².
@@ -41,7 +32,7 @@ pub fn add_per_area(table: &mut Table, result: &BiasResult, area: f64) {
         let density = all.map_or(0.0, |all| all.galaxies as f64 / (images * area));
         let error = all
             .filter(|_| of_unit)
-            .and_then(|all| shear_error(all, area));
+            .and_then(|all| all.shear_error(area));
         let error = error.unwrap_or(f64::NAN);
         let effective = (SHAPE_NOISE / error).powi(2);
         most = most.max(effective / density);

@@ -11,6 +11,7 @@ use shearq_scoring::{
     OddResponse, Repeated, RowCounts, SetScore,
 };
 
+use crate::catalogues::PLAIN_SET;
 use crate::record::{FRAME, SetRecord, columns_named, mean};
 use crate::score::{Basis, ScoredSet};
 use crate::views::pages::bins;
@@ -181,7 +182,7 @@ fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
 
 fn set_cell(record: &SetRecord) -> Cell {
     match record.set {
-        0 => Cell::text("–"),
+        PLAIN_SET => Cell::text("–"),
         set => Cell::text(format!("{set:02}")),
     }
 }
