@@ -548,6 +548,8 @@ mod tests {
                 matrix: kind & 4 > 0,
             };
             let (mut found, mut expected) = (vec![0.0; layout.len()], vec![0.0; layout.len()]);
+            // Of the responses to the other component, of galaxies and shears.
+            let mut mixed = [0.0; 2];
             for number in 1..20 {
                 let value = |k: i32| (f64::from(number * k) * 0.7).sin();
                 let row = Row {
@@ -566,8 +568,17 @@ mod tests {
                     }
                     plain(layout, &mut expected, pair, &row);
                 }
+                for k in 0..2 {
+                    mixed[k] += row.response[k][1 - k] * row.g[k];
+                }
             }
             assert_eq!(found, expected, "{layout:?}");
+            for component in 0..layout.components() {
+                let of = layout.mixed(&found, component);
+                let of = of.map(|of| of.response(OWN, ONE));
+                let expected = layout.matrix.then(|| mixed[component % 2]);
+                assert_eq!(of, expected, "{layout:?} {component}");
+            }
         }
     }
 }
