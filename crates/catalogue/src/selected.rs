@@ -60,11 +60,6 @@ pub fn write_selected(
         ..run.clone()
     };
     let claim = record.claim(to)?;
-    let keys: Vec<String> = KEYS
-        .iter()
-        .chain(&PRINTS)
-        .map(|key| (*key).to_owned())
-        .collect();
     let (mut kept, mut good) = (0, 0);
     for set in files.wanted(&[]) {
         if let Source::Simulated(_) = run.source {
@@ -82,7 +77,7 @@ pub fn write_selected(
             good += shapes.e.iter().filter(|e| e[0].is_finite()).count();
             let changed = selected_table(&path, &shapes, &read)?;
             // The origin of the catalogue stays, so that it is still compared with its images.
-            let mut metadata = table::read_metadata(&path, run.format, keys.iter())?;
+            let mut metadata = table::read_metadata(&path, run.format, KEYS.iter().chain(&PRINTS))?;
             metadata.insert("select".into(), stated.text.clone());
             let out = record.catalogue(to, set, image);
             claim.check()?;

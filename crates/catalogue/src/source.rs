@@ -1288,9 +1288,8 @@ pub fn states_shearq(path: &Path) -> Result<Option<bool>, FileError> {
     let Some(format) = FileFormat::of(path) else {
         return Ok(None);
     };
-    let key = "creator".to_owned();
-    let stated = table::read_metadata(path, format, std::iter::once(&key))?;
-    let creator = stated.get(&key);
+    let stated = table::read_metadata(path, format, ["creator"])?;
+    let creator = stated.get("creator");
     Ok(Some(creator.is_some_and(|own| own.starts_with("shearq "))))
 }
 
@@ -1471,11 +1470,9 @@ fn check_chosen<'a>(
 
 // Checks that the sheared catalogues of shearq are for a shear of `step`, if the settings are there.
 fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
-    let key = "settings".to_owned();
     let stated = || {
-        let read = table::read_metadata(path, FileFormat::of(path)?, std::iter::once(&key));
-        let metadata = read.ok()?;
-        let settings: toml::Table = metadata.get(&key)?.parse().ok()?;
+        let metadata = table::read_metadata(path, FileFormat::of(path)?, ["settings"]).ok()?;
+        let settings: toml::Table = metadata.get("settings")?.parse().ok()?;
         settings.get("shape")?.get("sheared_step")?.as_float()
     };
     match stated() {

@@ -40,8 +40,7 @@ pub fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
 
 // The noise of the star of a catalogue of shearq; `None` if the catalogue does not state it.
 pub fn of_catalogue(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
-    let keys = [PSF_NOISE, PSF].map(str::to_owned);
-    stated(path, table::read_metadata(path, format, keys.iter())?)
+    stated(path, table::read_metadata(path, format, [PSF_NOISE, PSF])?)
 }
 
 // The noise that metadata state, of a star that is named by its fingerprint or, without one, as the catalogue.

@@ -169,8 +169,10 @@ impl CommonAxes {
 
 /// The axes that a catalogue states.
 pub fn stated_axes(path: &Path, format: FileFormat) -> Result<Axes, FileError> {
-    let keys = [CATALOGUE_FRAME.to_owned()];
-    axes_of(path, &table::read_metadata(path, format, keys.iter())?)
+    axes_of(
+        path,
+        &table::read_metadata(path, format, [CATALOGUE_FRAME])?,
+    )
 }
 
 /// The axes that the metadata of the catalogue `path` state by [`CATALOGUE_FRAME`].

@@ -376,7 +376,7 @@ pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
         Ending::Parquet => FileFormat::Parquet,
         Ending::Fits => FileFormat::Fits,
     };
-    let mut found = read_metadata(path, format, std::iter::once(&key.to_owned()))?;
+    let mut found = read_metadata(path, format, [key])?;
     Ok(found.remove(key).map(|value| value.trim().to_owned()))
 }
 
@@ -391,7 +391,7 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
 }
 
 /// The values of `keys` that a table written by [`write()`] carries, those that it has.
-pub fn read_metadata<'a>(
+pub fn read_metadata(
     path: &Path,
     format: FileFormat,
     keys: impl Iterator<Item = &'a String>,
@@ -399,7 +399,10 @@ pub fn read_metadata<'a>(
     match format {
         FileFormat::Parquet => {
             let mut all = parquet::metadata(path)?;
-            Ok(keys.filter_map(|key| all.remove_entry(key)).collect())
+            let keys = keys.into_iter();
+            Ok(keys
+                .filter_map(|key| all.remove_entry(key.as_ref()))
+                .collect())
         }
         FileFormat::Fits => {
             let found = fits::read_table_keys(path, keys)?;

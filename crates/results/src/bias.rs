@@ -501,8 +501,7 @@ fn frame_and_images(
         let path = &source.place.path;
         let own = source.columns.is_of_shearq() && source.frame.is_none();
         if let Some(format) = FileFormat::of(path).filter(|_| own) {
-            let keys = [CATALOGUE_FRAME, GALAXIES].map(str::to_owned);
-            let mut metadata = table::read_metadata(path, format, keys.iter())?;
+            let mut metadata = table::read_metadata(path, format, [CATALOGUE_FRAME, GALAXIES])?;
             axes.add(path, axes_of(path, &metadata)?, true)?;
             *image = metadata.remove(GALAXIES);
         }

@@ -229,8 +229,7 @@ fn covariance_of_pairs(
 
 // The measurement noise of e1 and e2 of a galaxy that a catalogue of rotated pairs states.
 fn e_noise(path: &Path, format: FileFormat) -> Result<Option<[f64; 2]>, FileError> {
-    let keys = [E_NOISE.to_owned()];
-    let metadata = table::read_metadata(path, format, keys.iter())?;
+    let metadata = table::read_metadata(path, format, [E_NOISE])?;
     let text = metadata.get(E_NOISE);
     text.map(|text| number_pair(path, E_NOISE, text, 1.0))
         .transpose()

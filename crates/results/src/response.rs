@@ -64,10 +64,8 @@ fn is_to_divide(path: &Path) -> Result<bool, FileError> {
     let Some(format) = FileFormat::of(path) else {
         return Ok(false);
     };
-    let metadata = table::read_metadata(path, format, [RESPONSE.to_owned()].iter())?;
-    Ok(metadata
-        .get(RESPONSE)
-        .is_some_and(|text| text == NOT_APPLIED))
+    let mut metadata = table::read_metadata(path, format, [RESPONSE])?;
+    Ok(metadata.remove(RESPONSE).as_deref() == Some(NOT_APPLIED))
 }
 
 fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileError> {
@@ -132,6 +130,14 @@ struct Image {
 // The galaxies that share a response: all (without a set), or the galaxies of a set or of an image of a folder.
 type Group = (usize, Option<u32>, Option<u32>);
 
+// Metadata of catalogues that shears keep.
+const KEPT: [&str; 5] = [
+    CATALOGUE_FRAME,
+    CATALOGUE_FIRST_PIXEL,
+    "creator",
+    "submiss",
+    "elltype",
+];
 const RESPONSES: [&str; 4] = ["R11", "R22", "R12", "R21"];
 
 // Responses and weights of the galaxies without a flag.
@@ -175,15 +181,7 @@ pub fn shears(
         for set in files.wanted(sets) {
             for (image, path) in files.of_set(set) {
                 refuse_seen(&mut seen, &run, &path, (set, image))?;
-                let keys = [
-                    CATALOGUE_FRAME,
-                    CATALOGUE_FIRST_PIXEL,
-                    "creator",
-                    "submiss",
-                    "elltype",
-                ]
-                .map(str::to_owned);
-                let stated = table::read_metadata(&path, run.format, keys.iter())?;
+                let stated = table::read_metadata(&path, run.format, KEPT)?;
                 let own = axes_of(&path, &stated)?;
                 axes.add(&path, own, false)?;
                 check_positions(&path, treecorr, own)?;
@@ -268,8 +266,7 @@ fn refuse_seen(
     path: &Path,
     (set, image): (u32, u32),
 ) -> Result<(), FileError> {
-    let key = GALAXIES.to_owned();
-    let print = table::read_metadata(path, run.format, std::iter::once(&key))?.remove(GALAXIES);
+    let print = table::read_metadata(path, run.format, [GALAXIES])?.remove(GALAXIES);
     let identity = match (print, &run.source) {
         (Some(print), _) => print,
         (None, Source::Simulated(settings)) => format!("{settings:?} {set} {image}"),

@@ -752,16 +752,21 @@ fn read_part(
 }
 
 /// Text values of `keys` in the header of a file's first extension. Absent keys are left out.
-pub fn read_table_keys<'a>(
+pub fn read_table_keys(
     path: &Path,
-    keys: impl Iterator<Item = &'a String>,
+    keys: impl IntoIterator<Item = impl AsRef<str>>,
 ) -> Result<BTreeMap<String, String>, FileError> {
     let mut file = File::open(path, Content::Table)?;
     if !file.next()? {
         return Err(file.fault("there is no table in this file".into()));
     }
-    let value = |key: &String| (key.clone(), file.text(&key.to_ascii_uppercase()));
-    Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
+    let mut found = BTreeMap::new();
+    for key in keys {
+        let key = key.as_ref();
+        found.insert(key.to_owned(), file.text(&key.to_ascii_uppercase()));
+    }
+    found.retain(|_, value| !value.is_empty());
+    Ok(found)
 }
 
 /// The vector in the first row of a column, and the cards of the header: texts keep their quotes. `table` is a number as in
