@@ -11,7 +11,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use shearq_bias::Design;
 use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::recognition::read_presets;
-use shearq_catalogue::request::{DEFAULT_STEP, Request, Units};
+use shearq_catalogue::request::{Request, Units};
 use shearq_catalogue::roles::role_names;
 use shearq_catalogue::truth::Expanded;
 use shearq_challenge::kind::{Kind, RankBy};
@@ -219,7 +219,7 @@ impl TableReading {
                 Some(column) => Units::Column(column.to_owned()),
             },
             drop_missing: self.drop_missing,
-            step: self.step.unwrap_or(DEFAULT_STEP),
+            step: self.step,
             ..Request::new(found)
         })
     }

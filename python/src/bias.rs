@@ -301,22 +301,11 @@ pub(crate) fn needed_columns(
         return Ok(names);
     };
     let request = Request {
-        catalogues: Vec::new(),
         names: names_of(&columns, &preset)?,
-        truth: Truth::Columns,
-        shapes: None,
-        sign: TrueSign::Convention,
         bins,
-        like: None,
-        paired: false,
         selection,
-        unsheared: Vec::new(),
-        design: None,
         units: units_of(units),
-        drop_missing: false,
-        step: 0.01,
-        placed: None,
-        without_catalogue: Vec::new(),
+        ..Request::default()
     };
     let reading = Reading {
         request: &request,
@@ -445,7 +434,7 @@ pub(crate) fn bias_sums(
         design: design.map(design_of).transpose()?,
         units: units_of(units),
         drop_missing,
-        step,
+        step: Some(step),
         placed: None,
         without_catalogue,
     };

@@ -172,7 +172,7 @@ pub(crate) fn galaxies<'py>(
         names: names_of(&columns, &preset)?,
         shapes: ellipticity.map(shapes_of).transpose()?,
         drop_missing,
-        step,
+        step: Some(step),
         placed: Some(Placed::default()),
         ..Request::default()
     };

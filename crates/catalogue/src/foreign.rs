@@ -18,7 +18,7 @@ use crate::columns::{Names, Shapes};
 use crate::failures::shown;
 use crate::galaxies::{Galaxies, Galaxy};
 use crate::recognition::Survey;
-use crate::request::{DEFAULT_STEP, Placed, Request};
+use crate::request::{Placed, Request};
 
 /// How to read another program's catalogues. Columns that are not named are recognised.
 ///
@@ -79,7 +79,7 @@ pub struct Foreign {
     pub drop_missing: bool,
     /// The largest valid |e|, after conversion.
     pub max_modulus: Option<f64>,
-    /// Artificial shear of metacalibration; [`DEFAULT_STEP`] if it is not stated.
+    /// Artificial shear of metacalibration.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub step: Option<f64>,
     #[serde(default)]
@@ -226,7 +226,7 @@ impl Foreign {
             names,
             shapes,
             drop_missing: self.drop_missing,
-            step: self.step.unwrap_or(DEFAULT_STEP),
+            step: self.step,
             placed: Some(Placed {
                 missing: self.missing,
                 max_modulus: self.max_modulus,

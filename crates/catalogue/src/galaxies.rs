@@ -190,7 +190,7 @@ impl CalibrationSums {
         }
         let selects = own.sources.first().is_some_and(|own| own.selects);
         self.has_matrix = own.sources.first().is_some_and(Source::has_matrix);
-        let shear_difference = 2.0 * own.request.step;
+        let shear_difference = 2.0 * own.request.step();
         own.each(|_, row| {
             if let Some(row) = row {
                 self.add_row(row, selects, shear_difference);

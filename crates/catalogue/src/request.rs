@@ -11,7 +11,7 @@ use crate::truth::{Expanded, TrueSign, Truth};
 /// Bins of all quantities together. KiDS calibrates in 20 × 20 bins of S/N and size (Fenech Conti et al. 2017, MNRAS 467, 1627).
 pub const MAX_BINS: usize = 400;
 /// Artificial shear of metacalibration in ngmix and metadetect, whose catalogues do not state it.
-pub const DEFAULT_STEP: f64 = 0.01;
+const DEFAULT_STEP: f64 = 0.01;
 /// Quantities that are binned at the same time.
 pub const MAX_AXES: usize = 3;
 
@@ -62,7 +62,7 @@ pub struct Placed {
     pub max_modulus: Option<f64>,
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Request {
     pub catalogues: Vec<Input>,
     pub names: Names,
@@ -83,8 +83,8 @@ pub struct Request {
     pub paired: bool,
     /// Whether rows with missing numbers are left out.
     pub drop_missing: bool,
-    /// Artificial shear of metacalibration.
-    pub step: f64,
+    /// Artificial shear of metacalibration, if it is not 0.01.
+    pub step: Option<f64>,
     /// Whether they are galaxies on a grid, whose positions are read.
     pub placed: Option<Placed>,
     /// Remarks about images of the data that have no catalogue.
@@ -102,6 +102,10 @@ impl Request {
         }
     }
 
+    pub fn step(&self) -> f64 {
+        self.step.unwrap_or(DEFAULT_STEP)
+    }
+
     /// The first column that is declared unsheared and that neither a condition nor bins use: it is probably misspelt.
     pub fn unused_unsheared(&self) -> Option<&str> {
         let condition = self.selection.as_ref().and_then(|own| own.rows.as_ref());
@@ -112,28 +116,5 @@ impl Request {
             .collect();
         let mut declared = self.unsheared.iter().map(String::as_str);
         declared.find(|name| !used.contains(name))
-    }
-}
-
-impl Default for Request {
-    fn default() -> Self {
-        Request {
-            catalogues: Vec::new(),
-            names: Names::default(),
-            truth: Truth::default(),
-            shapes: None,
-            sign: TrueSign::default(),
-            bins: Vec::new(),
-            like: None,
-            selection: None,
-            unsheared: Vec::new(),
-            design: None,
-            units: Units::default(),
-            paired: false,
-            drop_missing: false,
-            step: DEFAULT_STEP,
-            placed: None,
-            without_catalogue: Vec::new(),
-        }
     }
 }

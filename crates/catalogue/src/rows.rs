@@ -883,7 +883,7 @@ impl<'a> TableRows<'a> {
             for (own, columns) in all.iter_mut().zip(sheared) {
                 *own = converted(self.pair(*columns, at))?;
             }
-            let step = 2.0 * self.reading.request.step;
+            let step = 2.0 * self.reading.request.step();
             let of =
                 |i: usize, j: usize| self.signs[i][j] * (all[2 * j][i] - all[2 * j + 1][i]) / step;
             return Some((e, weighted(e, [0, 1].map(|i| [0, 1].map(|j| of(i, j))))));
@@ -901,7 +901,7 @@ impl<'a> TableRows<'a> {
                 response => response,
             },
             Response::Difference([plus, minus]) => {
-                (self.value(plus, at) - self.value(minus, at)) / (2.0 * self.reading.request.step)
+                (self.value(plus, at) - self.value(minus, at)) / (2.0 * self.reading.request.step())
             }
         }
     }

@@ -141,7 +141,7 @@ impl Source {
             kind.push(("units".into(), unit.clone()));
         }
         let step = match self.has_sheared_rows() || self.has_sheared_columns() {
-            true => reading.request.step.to_string(),
+            true => reading.request.step().to_string(),
             false => "none".into(),
         };
         let of = |name: &str, value: &str| (name.to_owned(), value.to_owned());
@@ -221,7 +221,7 @@ impl Source {
         let mut lines = vec![format!("Used: {used}.")];
         lines.extend(self.columns.unfit_presets.iter().cloned());
         lines.extend(self.columns.unused(&self.read(reading)));
-        lines.extend(self.response_of_sheared(reading.request.step));
+        lines.extend(self.response_of_sheared(reading.request.step()));
         let mut sheared = Vec::new();
         if self.sheared_flags {
             sheared.extend(self.places.all((Role::Flag, 1)));
@@ -888,7 +888,7 @@ fn source(
     }
     // A step that is wrong by a factor is an m of that factor.
     if columns.of_sheared((Role::E1, 1)).is_some() && chosen_by.any(has_sheared) {
-        check_step(path, reading.request.step)?;
+        check_step(path, reading.request.step())?;
     }
     let mut wanted = Wanted {
         path,

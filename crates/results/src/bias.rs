@@ -388,7 +388,7 @@ fn add_up(
             };
             let (row, own) = (&item.row, bin(0));
             // Differences of 1p and 1m are then derivatives.
-            let scaled = row.e.map(|e| e / (2.0 * request.step));
+            let scaled = row.e.map(|e| e / (2.0 * request.step()));
             let mut add_sheared = |bin, catalogue: usize, weight| {
                 sums.add_sheared(number, item.key, bin, catalogue - 1, (scaled, weight));
             };
