@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, open};
+use shearq_quantities::checked_when_read;
 use shearq_scoring::{Grid, TruthSign};
 
 use crate::files::{self, Files};
@@ -52,21 +53,7 @@ impl Default for Layout {
     }
 }
 
-impl Serialize for Layout {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived one.
-        Layout::serialize(self, serializer)
-    }
-}
-
-impl<'de> Deserialize<'de> for Layout {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // The derived one.
-        let layout = Layout::deserialize(deserializer)?;
-        layout.validate().map_err(serde::de::Error::custom)?;
-        Ok(layout)
-    }
-}
+checked_when_read!(Layout);
 
 impl Layout {
     // Checks every value against its range.

@@ -56,6 +56,26 @@ macro_rules! hints {
     };
 }
 
+/// Serde of settings whose derived functions are their own (`remote = "Self"`), so that reading checks them by `validate`.
+#[macro_export]
+macro_rules! checked_when_read {
+    ($of:ty) => {
+        impl Serialize for $of {
+            fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                <$of>::serialize(self, serializer)
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $of {
+            fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                let settings = <$of>::deserialize(deserializer)?;
+                settings.validate().map_err(serde::de::Error::custom)?;
+                Ok(settings)
+            }
+        }
+    };
+}
+
 /// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
 pub fn columns_of(count: usize) -> usize {
     let root = count.isqrt();

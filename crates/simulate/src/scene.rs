@@ -15,11 +15,11 @@ use std::f64::consts::TAU;
 use ndarray::Array2;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::apply;
 use shearq_quantities::{
-    FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Shear, TransformedPsf,
+    FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Shear, TransformedPsf, checked_when_read,
 };
 
 use super::field::{MAX_RANDOM_SHEAR, random_shear};
@@ -166,20 +166,7 @@ impl Default for SceneSettings {
     }
 }
 
-impl Serialize for SceneSettings {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived function: `remote` makes it one of the type, so that deserialization can validate.
-        SceneSettings::serialize(self, serializer)
-    }
-}
-
-impl<'de> Deserialize<'de> for SceneSettings {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let settings = SceneSettings::deserialize(deserializer)?;
-        settings.validate().map_err(serde::de::Error::custom)?;
-        Ok(settings)
-    }
-}
+checked_when_read!(SceneSettings);
 
 // More than deep surveys have in one filter.
 const MAX_EPOCHS: u32 = 999;

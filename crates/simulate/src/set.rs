@@ -10,11 +10,9 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
-use shearq_quantities::PsfTransform;
-use shearq_quantities::Shear;
+use serde::{Deserialize, Serialize};
 use shearq_quantities::fourier::Complex64;
-use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, checked_when_read};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Bins, Definition, Grid, TrueShear};
 
@@ -118,20 +116,7 @@ impl FixedPsf {
     }
 }
 
-impl Serialize for SimulationSettings {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived function: `remote` makes it one of the type, so that deserialization can validate.
-        SimulationSettings::serialize(self, serializer)
-    }
-}
-
-impl<'de> Deserialize<'de> for SimulationSettings {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let settings = SimulationSettings::deserialize(deserializer)?;
-        settings.validate().map_err(serde::de::Error::custom)?;
-        Ok(settings)
-    }
-}
+checked_when_read!(SimulationSettings);
 
 #[derive(Clone, Copy)]
 enum Purpose {
