@@ -90,7 +90,10 @@ fn source<'a>(
         )));
     }
     let psfs = match (&image.star, &arrays.stars, &image.formulas) {
-        (Some(star), None, None) => star_for_all(measurer, star.as_array()),
+        // Cut once here, not once per row.
+        (Some(star), None, None) => Star::cut(star.as_array(), measurer.configuration().psf_cut())
+            .map(|star| AllPsfs::Shared(Arc::new(star)))
+            .map_err(of_measuring),
         (None, Some(stars), None) => star_of_each(measurer, stars, count),
         (None, None, Some(formulas)) => formula_psfs(measurer, formulas.as_array(), count),
         _ => Err(PyValueError::new_err("psf: expected one kind of PSFs")),
@@ -251,13 +254,6 @@ fn measured<'a>(
     watch.report()?;
     // Without stamps there is no row, and no image was finished.
     Ok(whole.unwrap_or_default().checked()?)
-}
-
-// Cut once here, not once per row.
-fn star_for_all<'a>(measurer: &Measurer, star: ArrayView2<'_, f64>) -> PyResult<AllPsfs<'a>> {
-    let cut = measurer.configuration().psf_cut();
-    let found = Star::cut(star, cut).map_err(of_measuring)?;
-    Ok(AllPsfs::Shared(Arc::new(found)))
 }
 
 // Sizes are checked before the work, which would flag each galaxy with `BadPsf`.

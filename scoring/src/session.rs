@@ -167,11 +167,6 @@ impl SetSession {
 }
 
 impl ExaminedImage {
-    /// How its rows were used.
-    pub fn rows(&self) -> &RowCounts {
-        &self.rows
-    }
-
     /// Ellipticities that several galaxies share, as placeholders do.
     pub fn repeated(&self) -> Option<&Repeated<2>> {
         self.repeated.as_ref()

@@ -45,11 +45,6 @@ impl Units {
         self.layout
     }
 
-    /// Number of bins.
-    pub fn bins(&self) -> usize {
-        self.bins
-    }
-
     pub(crate) fn count(&self) -> usize {
         self.units.len()
     }

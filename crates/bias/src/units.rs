@@ -60,11 +60,6 @@ impl UnitSums {
         self.layout
     }
 
-    /// Number of bins.
-    pub fn bins(&self) -> usize {
-        self.bins
-    }
-
     /// How many catalogues of equal weight would determine the mean shear as well: (Σ W)²/Σ W², where W is what a catalogue's
     /// ellipticities are divided by. The smaller one of both components.
     pub fn effective_catalogues(&self) -> f64 {

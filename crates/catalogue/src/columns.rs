@@ -432,9 +432,10 @@ impl Names {
 }
 
 /// Which program wrote a catalogue, recognised by its columns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Preset {
     /// No known program.
+    #[default]
     Plain,
     /// shearq, without sheared catalogues.
     Shearq,
@@ -481,7 +482,7 @@ impl Preset {
     }
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Columns {
     columns: BTreeMap<Key, String>,
     pub preset: Preset,
@@ -528,7 +529,10 @@ impl Columns {
             let mut all = all.filter(|own| names.key_of(own).is_none());
             all.clone().find(|own| *own == name).or_else(|| all.next())
         };
-        let pairs = known_pairs(free);
+        // The names of e1 and e2 that the table has, both of one method.
+        let pairs = names_of_role(Role::E1).zip(names_of_role(Role::E2));
+        let pairs = pairs.filter_map(|(e1, e2)| Some([free(e1)?, free(e2)?]));
+        let pairs: Vec<[&String; 2]> = pairs.collect();
         let chosen = chosen_pair(found, names, &pairs);
         let mut columns = columns_by_role(path, found, names, survey, (&pairs, chosen), free)?;
         let name_of_e1 = |columns: &BTreeMap<Key, String>| {
@@ -589,16 +593,10 @@ impl Columns {
             preset,
             survey: survey.map(|survey| survey.name.clone()),
             distortion,
-            doubtful_weights: Vec::new(),
-            unused: Vec::new(),
-            unknown: Vec::new(),
             others,
             flags,
-            choices: Vec::new(),
-            steps: Vec::new(),
-            step_size: None,
             unfit_presets: names.unfit_presets(found),
-            texts: BTreeMap::new(),
+            ..Columns::default()
         };
         if preset == Preset::Metacal && !names.is_given(Role::E1) {
             columns.take_unsheared(found);
@@ -784,13 +782,6 @@ fn method_of(name: &str) -> &str {
     let longest = longest.filter(|_| plain != "eK_gK");
     // Letters that are not ASCII are as long as they were.
     longest.map_or("", |end| &name[..plain.len() - end.len()])
-}
-
-// The names of e1 and e2 that a table has, both of one method.
-fn known_pairs<'f>(free: &dyn Fn(&str) -> Option<&'f String>) -> Vec<[&'f String; 2]> {
-    let names = names_of_role(Role::E1).zip(names_of_role(Role::E2));
-    let pairs = names.filter_map(|(e1, e2)| Some([free(e1)?, free(e2)?]));
-    pairs.collect()
 }
 
 // The column of each role but flags: the given one, that of the survey, or one with a known name.

@@ -20,9 +20,7 @@ use polars_arrow_format::ipc::planus::ReadAsRoot;
 use polars_arrow_format::ipc::{Block, MessageHeaderRef, MessageRef, RecordBatchRef};
 
 use crate::FileError;
-use crate::fields::{
-    Wanted, decoded, decoded_type, guarded, names, numbers_alone, pick, with_missing,
-};
+use crate::fields::{Wanted, decoded, decoded_type, guarded, names, pick, with_missing};
 use crate::frames::{Metadata, frame};
 use crate::open;
 
@@ -32,7 +30,7 @@ const MAX_EXPANSION: u64 = 1 << 15;
 // Bytes of a buffer of text with 32-bit offsets, the usual ones.
 const MAX_BUFFER: u64 = 1 << 31;
 
-/// All columns, or those in `wanted`, as [`crate::parquet::read_numbers`] has them.
+/// All columns, or those in `wanted`, as [`crate::parquet::read`] has them.
 pub(crate) fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -61,7 +59,7 @@ pub(crate) fn read(
     })?;
     let mut all = all.unwrap_or_default();
     all.rechunk_mut();
-    numbers_alone(path, all, wanted.is_some())
+    Ok(all)
 }
 
 // Makes columns floats that are floats in another batch, where integers are missing.

@@ -33,7 +33,7 @@ use serde_json::{Map, Value, json};
 
 use crate::FileError;
 use crate::fields::{
-    MAX_VECTOR, Wanted, decoded, decoded_type, guarded, names, numbers_alone, pick, with_missing,
+    MAX_VECTOR, Wanted, decoded, decoded_type, guarded, names, pick, with_missing,
 };
 use crate::frames::{Metadata, element_name, frame};
 use crate::open;
@@ -201,16 +201,6 @@ pub fn read(
     frame(columns).map_err(|error| FileError::new(path, error))
 }
 
-/// The same of columns of numbers: columns of text are left out, and refused if they are wanted.
-pub(crate) fn read_numbers(
-    path: &Path,
-    wanted: Option<&[&str]>,
-    most_rows: usize,
-) -> Result<DataFrame, FileError> {
-    let table = read(path, wanted, most_rows)?;
-    numbers_alone(path, table, wanted.is_some())
-}
-
 /// Reads the columns `wanted` by row groups of at most `most_rows` rows, and gives each group to `take`.
 pub(crate) fn read_groups(
     path: &Path,
@@ -231,7 +221,7 @@ pub(crate) fn read_groups(
             let detail = format!("found a row group of {rows} rows, expected at most {most_rows}");
             return Err(damaged(path, detail));
         }
-        let column = |field| with_missing(path, source.read_chunk(field, number)?);
+        let column = |field| with_missing(path, source.read_rows(field, number, None)?);
         let columns = fields.iter().map(column);
         let columns = columns.collect::<Result<_, FileError>>()?;
         take(frame(columns).map_err(|error| FileError::new(path, error))?)?;
@@ -393,7 +383,7 @@ impl<'a> Source<'a> {
             }
         };
         for number in 0..self.footer.row_groups.len() {
-            let series = self.read_chunk(&wanted, number)?;
+            let series = self.read_rows(&wanted, number, None)?;
             column = match number {
                 0 => series,
                 _ => {
@@ -413,12 +403,7 @@ impl<'a> Source<'a> {
         with_missing(self.path, column.rechunk())
     }
 
-    /// The rows of a decoded column in one row group.
-    fn read_chunk(&mut self, wanted: &Wanted, number: usize) -> Result<Series, FileError> {
-        self.read_rows(wanted, number, None)
-    }
-
-    /// The same, or the first `most` rows.
+    /// The rows of a decoded column in one row group, or the first `most`.
     fn read_rows(
         &mut self,
         wanted: &Wanted,

@@ -17,6 +17,7 @@ use crate::frames::{Metadata, reals};
 
 use crate::FileError;
 use crate::content::Content;
+use crate::fields::numbers_alone;
 use crate::open::is_there;
 
 use crate::fits::TableHead;
@@ -268,12 +269,13 @@ pub fn read_from(
         default_names: &text::CHALLENGE_COLUMNS,
         most_rows,
     };
-    match Ending::of(path) {
-        Ending::Parquet => parquet::read_numbers(path, wanted, most_rows),
-        Ending::Arrow => arrow::read(path, wanted, most_rows),
-        Ending::Fits => fits::read_table(path, wanted, place.table.as_deref()),
-        Ending::Text => text::read(path, &request),
-    }
+    let table = match Ending::of(path) {
+        Ending::Parquet => parquet::read(path, wanted, most_rows)?,
+        Ending::Arrow => arrow::read(path, wanted, most_rows)?,
+        Ending::Fits => return fits::read_table(path, wanted, place.table.as_deref()),
+        Ending::Text => return text::read(path, &request),
+    };
+    numbers_alone(path, table, wanted.is_some())
 }
 
 /// The number that a field of a text table stands for: also a truth value (1 or 0), and NaN if it is missing.
@@ -394,7 +396,7 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
 pub fn read_metadata(
     path: &Path,
     format: FileFormat,
-    keys: impl Iterator<Item = &'a String>,
+    keys: impl IntoIterator<Item = impl AsRef<str>>,
 ) -> Result<Metadata, FileError> {
     match format {
         FileFormat::Parquet => {

@@ -171,7 +171,7 @@ fn leave_out_of_chips(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), F
             && plans[at]
                 .positions
                 .as_ref()
-                .is_some_and(|found| !found.in_degrees())
+                .is_some_and(|found| !found.degrees)
         {
             let message = format!(
                 "x and y are pixels of one chip (found one table for {} chips, expected right ascension and declination, or a table for each)",

@@ -446,11 +446,6 @@ impl PsfTransform {
         })
     }
 
-    /// The tabulated profile.
-    pub fn profile(&self) -> PsfProfile {
-        self.profile
-    }
-
     /// The transform at the square of k·FWHM.
     pub fn at(&self, k_fwhm2: f64) -> f64 {
         self.table.at(k_fwhm2)

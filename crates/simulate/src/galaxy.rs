@@ -340,14 +340,6 @@ impl Galaxy {
         Ok(self)
     }
 
-    pub fn scaled(mut self, factor: f64) -> Result<Self, GalaxyError> {
-        for component in &mut self.components[..self.count] {
-            component.flux *= factor;
-            component.check()?;
-        }
-        Ok(self)
-    }
-
     /// The galaxy turned about the origin by an angle from +x to +y.
     pub fn turned(mut self, radians: f64) -> Self {
         let (sin, cos) = radians.sin_cos();

@@ -163,10 +163,6 @@ impl Renderer {
         }
     }
 
-    pub fn stamp(&self) -> usize {
-        self.stamp
-    }
-
     /// Draws `galaxy`, convolved with `psf` and integrated over pixels, into `out`, a stamp in
     /// row-major order (rows are y). Called in parallel: it is serial, and takes no memory once
     /// `scratch` has grown.
@@ -199,11 +195,6 @@ impl Renderer {
             .resize_with(self.grids.len(), Transfer::default);
         let modes = grid.fill(self.stamp, galaxy, psf, centre, scratch, at);
         grid.transform(self.stamp, modes, scratch, out);
-    }
-
-    /// The period of the image, in pixels, that [`Renderer::render`] chooses for a galaxy.
-    pub fn period(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {
-        self.grids[self.choose_grid(galaxy, psf, centre)].size
     }
 
     fn choose_grid(&self, galaxy: &Galaxy, psf: &TransformedPsf<'_>, centre: (f64, f64)) -> usize {

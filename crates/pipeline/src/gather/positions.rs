@@ -76,7 +76,7 @@ pub(super) struct Positions {
     pub(super) id: Option<Column>,
     pub(super) carried: Vec<Column>,
     /// Whether the table has them in degrees.
-    degrees: bool,
+    pub(super) degrees: bool,
     /// Which columns they are, if the user did not name them.
     pub(super) note: Option<String>,
 }
@@ -169,10 +169,6 @@ impl Positions {
             degrees,
             note: note.flatten(),
         })
-    }
-
-    pub(super) fn in_degrees(&self) -> bool {
-        self.degrees
     }
 
     /// Whether the centres are on an exposure of this size.

@@ -1069,14 +1069,12 @@ pub fn with_failures(table: &mut Table, of: &'static str, checks: &[Checked]) {
 
 /// Plots of m and c in bins, or of all galaxies, with the tightest published requirement as a band.
 pub fn bias_plot(result: &BiasResult) -> PanelGrid {
-    let shown = || {
-        result
-            .bins
-            .iter()
-            .filter(|bin| is_shown(result, bin))
-            .enumerate()
-    };
     let binned = result.bins.len() > 1;
+    // All galaxies are shown if there are no bins.
+    let shown = || {
+        let bins = result.bins.iter();
+        bins.filter(|bin| !binned || bin.label != "all").enumerate()
+    };
     // Bins of several quantities, of texts and of surveys stand at their numbers.
     let cells = &result.about.cells;
     let by_number = cells.axes.len() > 1 || !cells.are_stated() || !result.populations.is_empty();
@@ -1151,11 +1149,6 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
         columns: 2,
         plots: plots.collect(),
     }
-}
-
-// Bins are shown, and all galaxies if there are no bins.
-fn is_shown(result: &BiasResult, bin: &BinResult) -> bool {
-    result.bins.len() == 1 || bin.label != "all"
 }
 
 fn middle(ranges: &[[f64; 2]]) -> f64 {

@@ -16,10 +16,6 @@ use crate::record::{FRAME, SetRecord, columns_named, mean};
 use crate::score::{Basis, ScoredSet};
 use crate::views::pages::bins;
 
-fn kind_cell(record: &SetRecord) -> Cell {
-    Cell::text(record.kind().map_or("", |kind| kind.image.label()))
-}
-
 fn kinds_note(records: &[SetRecord]) -> &'static str {
     match records.iter().any(|record| record.kind().is_some()) {
         true => " Kinds: as the GREAT10 sets with these numbers.",
@@ -189,9 +185,10 @@ fn set_cell(record: &SetRecord) -> Cell {
 
 // A row for each set, and a row of means for several, with the columns of records called `names`.
 fn table_of_sets(records: &[SetRecord], title: &str, names: &[&str]) -> Table {
-    let single = records
-        .iter()
-        .map(|set| ([set_cell(set), kind_cell(set)], std::slice::from_ref(set)));
+    let single = records.iter().map(|set| {
+        let kind = set.kind().map_or("", |kind| kind.image.label());
+        ([set_cell(set), Cell::text(kind)], std::slice::from_ref(set))
+    });
     let mean = ([Cell::text("mean"), Cell::Empty], records);
     let means = (records.len() > 1).then_some(mean);
     let rows: Vec<_> = single.chain(means).collect();
