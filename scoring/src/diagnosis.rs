@@ -179,10 +179,7 @@ pub fn repeated<const N: usize>(rows: &[[f64; N]], step: f64) -> Option<Repeated
     shared(None)
         .into_iter()
         .chain(components)
-        .reduce(|worst, own| match own.rows > worst.rows {
-            true => own,
-            false => worst,
-        })
+        .reduce(|worst, own| if own.rows > worst.rows { own } else { worst })
 }
 
 impl SetScorer {

@@ -164,10 +164,7 @@ impl ShearBias {
             true => Array2::zeros(g.dim()),
             false => &apart / square,
         };
-        let response = match constant {
-            true => 1.0,
-            false => (&of_m * &sum).sum(),
-        };
+        let response = if constant { 1.0 } else { (&of_m * &sum).sum() };
         let of_c = of_m.mapv(|w| 1.0 / galaxies - w * mean);
         let c = sum.sum() / galaxies - response * mean;
         ShearBias {

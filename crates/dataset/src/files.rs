@@ -99,10 +99,7 @@ impl Files {
 }
 
 fn unread(first: &Path, why: &str, count: usize) -> String {
-    let thing = match first.is_dir() {
-        true => "folder",
-        false => "file",
-    };
+    let thing = if first.is_dir() { "folder" } else { "file" };
     let others = match count - 1 {
         0 => String::new(),
         1 => ", like 1 other".to_owned(),
@@ -291,10 +288,7 @@ enum Piece<'a> {
 }
 
 fn most(of_set: bool) -> u32 {
-    match of_set {
-        true => MAX_SET,
-        false => MAX_IMAGE,
-    }
+    if of_set { MAX_SET } else { MAX_IMAGE }
 }
 
 fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {

@@ -343,10 +343,7 @@ fn in_order(a: &Cell, b: &Cell, descending: bool) -> Ordering {
         }
         _ => Ordering::Equal,
     };
-    match descending {
-        true => order.reverse(),
-        false => order,
-    }
+    if descending { order.reverse() } else { order }
 }
 
 /// A metric with jackknife replicates, so that differences can be paired.

@@ -285,8 +285,5 @@ pub(super) fn already(path: PathBuf) -> FileError {
 
 /// An error if the file was not `named`, because there is one at `path`.
 pub(super) fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
-    match named {
-        true => Ok(()),
-        false => Err(already(path)),
-    }
+    if named { Ok(()) } else { Err(already(path)) }
 }
