@@ -251,7 +251,6 @@ pub struct Names {
 
 /// Why `--columns` cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
 pub enum NameError {
     #[error("--columns: found `{0}`, expected ROLE=COLUMN with a role of {known}", known = role_names())]
     Syntax(String),

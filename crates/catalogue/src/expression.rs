@@ -9,7 +9,6 @@ use shearq_files::{FileError, MAX_EXACT_INTEGER};
 use thiserror::Error;
 
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[non_exhaustive]
 pub enum ExpressionError {
     #[error("cannot read the expression `{text}` (found {found}, expected {expected})")]
     Syntax {

@@ -9,7 +9,6 @@ use crate::own_columns::is_measured;
 
 /// Why `--where` and `--weight` cannot be used.
 #[derive(Debug, Clone, PartialEq, Error)]
-#[non_exhaustive]
 pub enum SelectionError {
     #[error(transparent)]
     Expression(#[from] ExpressionError),
@@ -49,7 +48,6 @@ impl SelectionError {
 
 /// What `--where` and `--weight` select, and their texts.
 #[derive(Debug, Clone, Default)]
-#[non_exhaustive]
 pub struct StatedSelection {
     /// Which rows count: a hard selection, whose response to shear follows from sheared catalogues or is missing.
     pub rows: Option<Expression>,

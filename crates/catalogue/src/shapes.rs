@@ -39,7 +39,6 @@ pub fn applied_weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileE
 
 /// Shapes of the rows of a catalogue.
 #[derive(Debug, Clone, PartialEq)]
-#[non_exhaustive]
 pub struct MeasuredShapes {
     /// Zero in rows of good galaxies.
     pub flags: Vec<f64>,

@@ -18,7 +18,6 @@ pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
 
 /// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum ChallengeError {
     #[error(transparent)]
     File(#[from] FileError),

@@ -94,7 +94,6 @@ pub fn expected_m_error(area: f64) -> f64 {
 
 /// Why the catalogues of an entry cannot be summed. Nothing of it depends on the true shear.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum SceneError {
     #[error(transparent)]
     File(#[from] FileError),

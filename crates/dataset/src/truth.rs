@@ -29,7 +29,6 @@ pub struct Reading {
 
 /// Why the sign of g2 in a truth is not known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
 pub enum SignFault {
     #[error("the file states `{SIGN_KEY}: {}`, but `{}` was specified{}", word(*stated), word(*specified), tried(self.hint()))]
     Contradicted {

@@ -25,7 +25,6 @@ use thiserror::Error;
 
 /// What can stop the pipeline.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum PipelineError {
     /// A file that cannot be used.
     #[error(transparent)]

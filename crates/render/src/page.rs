@@ -10,7 +10,6 @@ use crate::html::{Block, Picture, Report, Section};
 use crate::table::{Table, TableFormat};
 
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum PageError {
     #[error(transparent)]
     Figure(#[from] FigureError),

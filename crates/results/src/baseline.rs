@@ -241,7 +241,6 @@ fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2];
 }
 
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum BaselineError {
     #[error(transparent)]
     Configuration(#[from] ConfigurationError),

@@ -152,7 +152,6 @@ pub struct BinResult {
 }
 
 #[derive(Debug, Clone)]
-#[non_exhaustive]
 pub struct BiasResult {
     /// All galaxies first, then each bin.
     pub bins: Vec<BinResult>,

@@ -212,7 +212,6 @@ fn given_catalogues(
 
 /// Why sets cannot be chosen.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum ChoiceError {
     #[error(
         "--where: unknown column of a results store (found `{found}`, expected one of {known})"

@@ -18,7 +18,6 @@ use shearq_catalogue::star_noise::{Stars, of_catalogue};
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]
-#[non_exhaustive]
 pub struct SetMean {
     pub set: u32,
     pub images: Vec<u32>,

@@ -24,7 +24,6 @@ use shearq_catalogue::galaxies::Calibration;
 
 /// Why catalogues cannot be scored or compared.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum ScoreError {
     #[error(transparent)]
     File(#[from] FileError),

@@ -178,7 +178,6 @@ impl Law {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
-#[non_exhaustive]
 pub enum GalaxyError {
     #[error("a half-light radius must be a positive number of pixels, not {0}")]
     Radius(f64),

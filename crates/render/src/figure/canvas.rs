@@ -39,7 +39,6 @@ const UNITS_PER_PIXEL: usize = 2;
 const MAX_AREA: f64 = 5e6;
 
 #[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
 pub enum FigureError {
     #[error("{}: found {found} as the figure's format; expected the extension `.pdf`, `.png` or `.svg`", path.display())]
     Extension { path: PathBuf, found: String },

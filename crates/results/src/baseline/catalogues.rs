@@ -196,7 +196,6 @@ const BIASES: [&str; 11] = [
 
 /// Why catalogues cannot be compared with their baseline.
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum CatalogueError {
     #[error(transparent)]
     File(#[from] FileError),

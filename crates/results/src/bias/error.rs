@@ -11,7 +11,6 @@ use shearq_scoring::TruthSign;
 use thiserror::Error;
 
 #[derive(Debug, Error)]
-#[non_exhaustive]
 pub enum BiasFailure {
     #[error(transparent)]
     File(#[from] FileError),
