@@ -31,9 +31,6 @@ pub struct Galaxies {
 
 impl Galaxies {
     /// Finds the columns of a catalogue, at most `most` rows of a text without names, whose columns are called `unnamed`.
-    ///
-    /// # Errors
-    /// If there are no ellipticities or positions, or the file cannot be read.
     pub fn open(
         mut input: Input,
         request: &Request,

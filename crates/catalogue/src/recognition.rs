@@ -140,9 +140,6 @@ pub fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
 }
 
 /// The surveys that a file describes as `[[survey]]` of `catalogues.toml` does.
-///
-/// # Errors
-/// If the file cannot be read or has other keys or roles.
 pub fn read_presets(path: &Path) -> Result<Vec<Survey>, FileError> {
     let text = open::read_to_string(path, open::SETTINGS)
         .map_err(FileError::doing(path, "cannot read the surveys"))?;

@@ -101,9 +101,6 @@ impl MeasuredShapes {
     }
 
     /// The shapes of the catalogue `path` after a selection. They are shears already unless `with_response`.
-    ///
-    /// # Errors
-    /// If the file or a column cannot be read, or a selection cannot be applied.
     pub fn read(
         path: &Path,
         selection: Option<&StatedSelection>,

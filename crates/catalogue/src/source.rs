@@ -1078,9 +1078,6 @@ fn signs(formulas: &[Expression], columns: &Columns) -> [f64; 2] {
 }
 
 /// Gives `take` the table in memory, or the parts of the file.
-///
-/// # Errors
-/// Those of [`table::read_parts`] and of `take`.
 pub fn each_part(
     place: &Place,
     frame: Option<&DataFrame>,
@@ -1281,9 +1278,6 @@ fn is_own(place: &Place, frame: Option<&DataFrame>, names: &[String]) -> Result<
 }
 
 /// Whether the metadata of a file state that shearq wrote it; `None` of text, which has none.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn states_shearq(path: &Path) -> Result<Option<bool>, FileError> {
     let Some(format) = FileFormat::of(path) else {
         return Ok(None);

@@ -189,9 +189,6 @@ impl BranchSimulator {
     }
 
     /// All subfields with these numbers, in order.
-    ///
-    /// # Errors
-    /// None for the lattice of GREAT3.
     pub fn subfields(
         &self,
         numbers: impl Iterator<Item = usize>,

@@ -559,9 +559,6 @@ fn left_out(result: &BiasResult) -> Vec<String> {
 }
 
 /// The mean shear of catalogues without a true shear: c is then ⟨e⟩/R of all galaxies.
-///
-/// # Errors
-/// If there is no estimate.
 pub fn mean_shear_table(result: &BiasResult) -> Result<Table, BiasError> {
     let all = [result.all()?];
     let mut table = Table::titled("Mean shear");
