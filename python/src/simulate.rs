@@ -8,8 +8,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_pipeline::engine;
 use shearq_pipeline::simulate::simulator;
-use shearq_quantities::Shear;
-use shearq_quantities::{FunctionalPsf, PsfProfile};
+use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{

@@ -21,16 +21,15 @@ use shearq_dataset::threads::Pool;
 use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
-use shearq_results::aperture;
 use shearq_results::baseline::catalogues::{ScoredUnits, Units};
 use shearq_results::catalogues::Catalogues;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
-use shearq_results::store;
 use shearq_results::submit::{Packed, Sent, Submission, read_bandpowers};
 use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, notes, one_set_json, per_set, spectra};
+use shearq_results::{aperture, store};
 
 /// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
 ///

@@ -4,8 +4,7 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use shearq_files::frames::polars::DataFrame;
-use shearq_files::table;
-use shearq_files::{FileError, MAX_EXACT_INTEGER};
+use shearq_files::{FileError, MAX_EXACT_INTEGER, table};
 use thiserror::Error;
 
 #[derive(Debug, Clone, PartialEq, Eq, Error)]

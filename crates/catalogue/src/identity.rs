@@ -4,10 +4,9 @@ use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 use std::path::Path;
 
-use shearq_files::FileError;
 use shearq_files::frames::polars::{ChunkedArray, DataFrame, PolarsNumericType};
 use shearq_files::frames::reals;
-use shearq_files::table;
+use shearq_files::{FileError, table};
 
 // Integers that floats do not contain have other bits than the float with the same ones.
 const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;

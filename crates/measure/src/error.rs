@@ -1,7 +1,6 @@
 //! What can be wrong with a request.
 
-use shearq_quantities::{JacobianError, ProfileError};
-use shearq_quantities::{hints, tried};
+use shearq_quantities::{JacobianError, ProfileError, hints, tried};
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 

@@ -43,9 +43,8 @@ use crate::wcs::Wcs;
 use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_files::FileError;
-use shearq_files::atomic;
 use shearq_files::open::is_there;
+use shearq_files::{FileError, atomic};
 
 // Largest difference of the median offset from the one pixel between positions from 0 and from 1. Chosen by hand.
 const MAX_ORIGIN_MISMATCH_PX: f64 = 0.5;

@@ -6,13 +6,11 @@ use std::path::Path;
 
 use shearq_dataset::great3::{BranchLayout, GalaxyCatalogue};
 use shearq_dataset::grid::Mosaic;
-use shearq_files::FileError;
-use shearq_files::atomic;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::open::is_there;
-use shearq_files::parquet;
 use shearq_files::table::{MAX_ROWS, numbers};
+use shearq_files::{FileError, atomic, parquet};
 use shearq_quantities::{Frame, Jacobian};
 
 pub(crate) const ID: &str = "id";

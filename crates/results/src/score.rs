@@ -9,8 +9,7 @@ use shearq_dataset::run::kind_of;
 use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
-use shearq_quantities::Frame;
-use shearq_quantities::{hints, tried};
+use shearq_quantities::{Frame, hints, tried};
 use shearq_scoring::{
     AddedImages, Choice, ConventionMatch, Fault, FieldSum, Grid, OddImages, Options, RowCounts,
     ScoredImages, ScoringError, SetScore, SetSession, TruthSign, sign_by_correlation,

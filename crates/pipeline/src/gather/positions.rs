@@ -3,11 +3,9 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use shearq_files::FileError;
-use shearq_files::frames;
 use shearq_files::frames::polars::{Column, DataFrame, DataType};
-use shearq_files::names_of;
 use shearq_files::table::{self, Columns, FileFormat, MAX_ROWS, Named, Place};
+use shearq_files::{FileError, frames, names_of};
 use shearq_measure::{Observables, ShearedCatalogues};
 
 use crate::measure::COLUMNS;

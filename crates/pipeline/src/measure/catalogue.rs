@@ -3,10 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_files::FileError;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
-use shearq_files::table;
+use shearq_files::{FileError, table};
 use shearq_measure::{
     Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
 };

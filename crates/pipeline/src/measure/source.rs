@@ -18,8 +18,7 @@ use shearq_quantities::Jacobian;
 use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
 
 use crate::PipelineError;
-use crate::stamp_table::subpixel_offset;
-use crate::stamp_table::{ID, PLACE, StampTable};
+use crate::stamp_table::{ID, PLACE, StampTable, subpixel_offset};
 use crate::wcs::Wcs;
 use shearq_dataset::great3::{self, GalaxyCatalogue};
 use shearq_dataset::grid::{self, Mosaic, whole};
