@@ -362,19 +362,15 @@ pub(crate) fn bias_sums(
     let bins = bins.into_iter().map(|(of, count, edges)| {
         let of = Expression::parse(&of).map_err(value("bins"))?;
         let edges = match count {
-            Some(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
-            None if edges.is_empty() => Edges::Values,
-            None if (2..=MAX_BINS + 1).contains(&edges.len())
-                && edges.windows(2).all(|pair| pair[0] < pair[1]) =>
-            {
-                Edges::Given(edges)
-            }
-            _ => {
-                return Err(PyValueError::new_err(format!(
-                    "bins: expected 2 to {MAX_BINS} bins, or increasing edges"
-                )));
-            }
+            Some(count) => Edges::equal(count),
+            None if edges.is_empty() => Some(Edges::Values),
+            None => Edges::given(edges),
         };
+        let edges = edges.ok_or_else(|| {
+            PyValueError::new_err(format!(
+                "bins: expected 2 to {MAX_BINS} bins, or increasing edges"
+            ))
+        })?;
         Ok(Binning { of, edges })
     });
     let bins = bins.collect::<PyResult<Vec<_>>>()?;

@@ -159,16 +159,11 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
     };
     let of = Expression::parse(of)?;
     let edges = match bins.trim().parse::<usize>() {
-        Ok(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
-        Ok(_) => return Err(anyhow!("expected 2 to {MAX_BINS} bins")),
+        Ok(count) => Edges::equal(count).ok_or_else(|| anyhow!("expected 2 to {MAX_BINS} bins"))?,
         Err(_) => {
-            let edge = |text: &str| {
-                let edge = text.trim().parse::<f64>().ok();
-                edge.filter(|edge| edge.is_finite())
-            };
-            let edges: Option<Vec<f64>> = bins.split(',').map(edge).collect();
-            let edges = edges.filter(|edges| edges.len() > 2 && edges.is_sorted_by(|a, b| a < b));
-            Edges::Given(edges.ok_or_else(expected)?)
+            let edges = bins.split(',').map(|text| text.trim().parse().ok());
+            let edges: Option<Vec<f64>> = edges.collect();
+            edges.and_then(Edges::given).ok_or_else(expected)?
         }
     };
     Ok(Binning { of, edges })

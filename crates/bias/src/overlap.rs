@@ -108,13 +108,23 @@ mod tests {
     }
 
     fn units_of(layout: Layout, galaxies: std::ops::Range<u64>, shift: u64, factor: f64) -> Units {
+        weighted(layout, galaxies, shift, factor, |_| 1.0)
+    }
+
+    fn weighted(
+        layout: Layout,
+        galaxies: std::ops::Range<u64>,
+        shift: u64,
+        factor: f64,
+        weight: impl Fn(u64) -> f64,
+    ) -> Units {
         let mut sums = UnitSums::new(layout, 1, 1);
         for galaxy in galaxies {
             let e = shape(galaxy);
             let response = 1.0 + 0.1 * shape(galaxy + 2_000_000 + shift);
             let row = Row {
                 e: [factor * e, factor * shape(galaxy + 1_000_000)],
-                weight: 1.0,
+                weight: weight(galaxy),
                 g: [0.02, 0.02],
                 response: [[response, 0.0], [0.0, response]],
                 ..Row::default()
@@ -147,6 +157,13 @@ mod tests {
         let other = units_of(layout, 0..1000, 0, 1.3);
         for found in [own.overlap(&other), other.overlap(&own)] {
             assert_eq!(found, own.overlap(&units(0..1000, 0, 1.3)));
+        }
+        // Galaxies without a weight have no ellipticity.
+        let some = weighted(Layout::default(), 0..1000, 0, 1.3, |galaxy| {
+            (galaxy % 3) as f64
+        });
+        for found in [own.overlap(&some), some.overlap(&own)] {
+            assert!(found.correlation.unwrap() > 0.9, "{found:?}");
         }
         // Too few for a correlation.
         let few = units(0..100, 0, 1.0).overlap(&units(0..100, 7, 1.0));

@@ -31,6 +31,22 @@ pub enum Edges {
     Values,
 }
 
+impl Edges {
+    /// So many bins; `None` of fewer than two or more than [`MAX_BINS`].
+    pub fn equal(count: usize) -> Option<Self> {
+        (2..=MAX_BINS)
+            .contains(&count)
+            .then_some(Edges::Equal(count))
+    }
+
+    /// Bins between edges; `None` if there are none or too many, or edges do not increase.
+    pub fn given(edges: Vec<f64>) -> Option<Self> {
+        let increase =
+            edges.iter().all(|edge| edge.is_finite()) && edges.is_sorted_by(|a, b| a < b);
+        ((2..=MAX_BINS + 1).contains(&edges.len()) && increase).then_some(Edges::Given(edges))
+    }
+}
+
 /// A catalogue of a survey, to whose galaxies simulated ones are weighted.
 #[derive(Debug, Clone)]
 pub struct Survey {
