@@ -81,41 +81,31 @@ pub struct Catalogue {
     /// Rows with a missing value, if those are left out.
     pub missing: u64,
     /// Rows with a number that stands for a failed measurement, such as −99, if those are left out.
-    #[serde(default)]
     pub failed: u64,
     /// Rows with a distortion above 1, to which no shear belongs. Noise makes them.
-    #[serde(default)]
     pub above_one: u64,
     /// Rows that do not count because the galaxy does not count under all test shears.
-    #[serde(default)]
     pub without_partner: u64,
     /// Rows that count with |e| above 1, and above 2.
-    #[serde(default)]
     pub beyond: [u64; 2],
     /// Pairs of numbers that many rows share exactly.
-    #[serde(default)]
     pub repeated: Vec<Repeated>,
     /// Rows that have the numbers of an earlier row, if these are not few.
-    #[serde(default)]
     pub copies: u64,
     /// Rows that have the identifier of an earlier row, if these are not few.
-    #[serde(default)]
     pub shared_identifiers: u64,
     /// Comparisons with a text, such as `band == 'r'`, that no row fulfils.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub unmatched: Vec<String>,
     /// A sum over the rows that count that no other galaxies have; 0 without rows.
-    #[serde(default)]
     pub content: u64,
     /// A row with much of the response.
-    #[serde(default)]
     pub dominant: Option<Dominant>,
     /// Range of the true shears g1 and g2 of the rows that count. Designs are recognised from it.
     pub shear: [Range; 2],
     /// Range of the ellipticities e1 and e2 of the rows that count.
     pub ellipticity: [Range; 2],
     /// The noise of the star that is the PSF of all its galaxies, if it is known.
-    #[serde(default)]
     pub star: Option<StarNoise>,
     /// The fingerprint of the image that it was measured on, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]

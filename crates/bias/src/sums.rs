@@ -84,7 +84,6 @@ pub struct Layout {
     pub sheared: bool,
     /// Whether rows have the responses R12 of e1 to g2 and R21 of e2 to g1. Then both components are fitted together.
     // Files of sums before the 2 × 2 response lack it.
-    #[serde(default)]
     pub matrix: bool,
 }
 
@@ -224,9 +223,7 @@ impl Layout {
             (response[1][0], [1, 0]),
             (row.weight, [0, 1]),
         ] {
-            let Some(sums) = matrices.next() else {
-                break;
-            };
+            let Some(sums) = matrices.next() else { break };
             for (sums, z_s) in sums.chunks_exact_mut(N).zip(z[a]) {
                 let scaled = factor * z_s;
                 for (sum, z_t) in sums.iter_mut().zip(z[b]) {
