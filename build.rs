@@ -13,9 +13,7 @@ fn main() {
     // An archive of the sources may have been unpacked in the repository of something else.
     let is_top = git(&["rev-parse", "--show-prefix"]).is_some_and(|prefix| prefix.is_empty());
     let commit = git(&["rev-parse", "--short=12", "HEAD"]).filter(|_| is_top);
-    let Some(commit) = commit else {
-        return;
-    };
+    let Some(commit) = commit else { return };
     println!("cargo::rustc-env=SHEARQ_COMMIT={commit}");
     // Each commit changes the branch or, if that is packed, the log. A path that is absent would run this at each build.
     let branch = git(&["symbolic-ref", "HEAD"]);

@@ -12,10 +12,8 @@ fn main() -> Result<(), shearq_scoring::ScoringError> {
 
     let modes = Decomposer::new(grid).decompose(Convention::STANDARD.apply(&e1, &e2)?)?;
     let bins = Bins::new(&grid, Definition::Corrected);
-    let (ee, bb) = (
-        bins.power(&modes.e, &modes.e)?,
-        bins.power(&modes.b, &modes.b)?,
-    );
+    let ee = bins.power(&modes.e, &modes.e)?;
+    let bb = bins.power(&modes.b, &modes.b)?;
     for b in SCORED {
         println!(
             "l = {:6.1}  EE = {:.3e}  BB = {:.3e}",

@@ -230,18 +230,12 @@ impl UnitSums {
     }
 
     fn units(self, arm: impl Fn(u32) -> u32, unit: impl Fn((u32, u64)) -> (u32, u64)) -> Units {
-        let UnitSums {
-            layout,
-            bins,
-            shift,
-            units,
-            ..
-        } = self;
+        let layout = self.layout;
         // Without sheared catalogues all sums are linear, so that arms make no difference.
         let arm = |catalogue| if layout.sheared { arm(catalogue) } else { 0 };
-        let named = units.into_iter();
+        let named = self.units.into_iter();
         let named = named.map(|(name, sums)| (unit(name), arm(name.0), sums));
-        Units::new((layout, bins, shift), named)
+        Units::new((layout, self.bins, self.shift), named)
     }
 
     pub(crate) fn of_catalogues(&self, wanted: impl Fn(u32) -> bool) -> Self {

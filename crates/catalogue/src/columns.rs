@@ -10,7 +10,7 @@ use shearq_submissions::EllipticityType;
 
 use crate::expression::{Expression, with_names};
 use crate::own_columns::refuse_divided;
-use crate::recognition::{Patterns, Survey, fits_any, has_any, names_of_role, recognition, words};
+use crate::recognition::{Survey, fits_any, has_any, names_of_role, recognition, words};
 use crate::roles::{Key, Role, keys, name_of, named, partner, role_names, sheared_pair};
 use crate::steps::{sheared_column, sheared_name, unsheared};
 
@@ -69,10 +69,8 @@ fn check_own_responses(path: &Path, columns: &BTreeMap<Key, String>) -> Result<(
     let Some(k) = [0, 1].into_iter().find(|&k| there[k] && !there[1 - k]) else {
         return Ok(());
     };
-    let (name, without) = (
-        &columns[&pairs[k][0]],
-        ["e1_1p=none,e1_1m=none", "e2_2p=none,e2_2m=none"][k],
-    );
+    let name = &columns[&pairs[k][0]];
+    let without = ["e1_1p=none,e1_1m=none", "e2_2p=none,e2_2m=none"][k];
     let message = format!(
         "`{name}` and its partner give the response of e{} alone (expected e{} under its own artificial shears, too)",
         k + 1,
@@ -1098,12 +1096,10 @@ pub fn counted_value(name: &str) -> Option<bool> {
 
 /// Whether the name of a column suggests that it is a weight of shapes.
 pub fn looks_like_weight(name: &str) -> bool {
-    let Patterns {
-        weight, no_weight, ..
-    } = &recognition().patterns;
+    let known = &recognition().patterns;
     // The dark energy w₀ of a mock catalogue.
     let is_w0 = name.eq_ignore_ascii_case("w_0");
-    has_any(weight, name) && !has_any(no_weight, name) && !is_w0
+    has_any(&known.weight, name) && !has_any(&known.no_weight, name) && !is_w0
 }
 
 // Errors of calibrations and of corrected shapes calibrate nothing.

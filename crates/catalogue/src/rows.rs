@@ -958,9 +958,7 @@ fn check_angles(
     for expression in reading.condition().into_iter().chain(reading.binned()) {
         let place = |own: &Operand| source.wanted.iter().position(|known| known == own);
         let places: Option<Vec<usize>> = expression.operands().iter().map(place).collect();
-        let Some(places) = places else {
-            continue;
-        };
+        let Some(places) = places else { continue };
         let rows = places.first().map_or(0, |place| columns[*place].len());
         expression
             .check_angles(rows, |at, k| columns[places[k]][at])

@@ -165,12 +165,8 @@ impl Source {
     // The columns that enter the result.
     fn read(&self, reading: &Reading<'_>) -> Vec<String> {
         // Read to find out whether they are what their names suggest.
-        let Columns {
-            doubtful_weights,
-            steps,
-            ..
-        } = &self.columns;
-        let tested = doubtful_weights.iter().chain(steps);
+        let tested = self.columns.doubtful_weights.iter();
+        let tested = tested.chain(&self.columns.steps);
         let is_tested = |name: &str| tested.clone().any(|own| own == name);
         let is_chosen = |name: &str| reading.chosen_by().any(|own| own == name);
         let read = self.wanted.iter().map(|own| own.column.as_str());
@@ -187,15 +183,11 @@ impl Source {
         let Some((name, found)) = unread.iter().find(|(name, _)| read.contains(&**name)) else {
             return Ok(());
         };
-        let Columns {
-            flags,
-            doubtful_weights,
-            ..
-        } = &self.columns;
-        let role = match self.columns.all().find(|(_, own)| own == name) {
+        let own = &self.columns;
+        let role = match own.all().find(|(_, own)| own == name) {
             Some((key, _)) => Some(name_of(key)),
-            None if flags.contains(name) => Some(name_of((Role::Flag, 0))),
-            None if doubtful_weights.contains(name) => Some(name_of((Role::Weight, 0))),
+            None if own.flags.contains(name) => Some(name_of((Role::Flag, 0))),
+            None if own.doubtful_weights.contains(name) => Some(name_of((Role::Weight, 0))),
             None => None,
         };
         let without = role.map_or(String::new(), |role| format!(", or --columns {role}=none"));
@@ -524,9 +516,7 @@ fn sources_of(
     if place.table.is_none() {
         let mut tables = Vec::new();
         for list in &found.named {
-            let Some(head) = &list.table else {
-                continue;
-            };
+            let Some(head) = &list.table else { continue };
             if let Some(catalogue) = catalogue_named(&head.name) {
                 let own = source(
                     table(head.number),

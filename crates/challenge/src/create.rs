@@ -196,10 +196,8 @@ pub fn simulated(
         version: shearq_dataset::VERSION.into(),
         settings,
     };
-    let (public, private) = (
-        DataFolder::new(folders.public),
-        DataFolder::new(folders.private),
-    );
+    let public = DataFolder::new(folders.public);
+    let private = DataFolder::new(folders.private);
     let data = Data {
         sets: simulation.sets.clone(),
         images: simulation.images,
@@ -310,10 +308,8 @@ pub fn of_images(
     let earlier = folders.prepare(plan)?;
     let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, None));
     key.write(folders.private)?;
-    let (public, private) = (
-        DataFolder::new(folders.public),
-        DataFolder::new(folders.private),
-    );
+    let public = DataFolder::new(folders.public);
+    let private = DataFolder::new(folders.private);
     for &set in &about.sets {
         let path = match truth {
             Some(pattern) => fill(pattern, set, 0).into(),
@@ -421,9 +417,7 @@ fn first_scores(
 // The noise of a first image becomes that of the mean of all images.
 fn average_images(of_first: &mut SetRecord, images: u32) {
     let images = f64::from(images);
-    let SetRecord {
-        metrics, errors, ..
-    } = of_first;
+    let (metrics, errors) = (&mut of_first.metrics, &mut of_first.errors);
     // The power of the noise, which dominates Q, averages down by their number.
     metrics.q *= images;
     // What c scatters between constant shears is noise, too.

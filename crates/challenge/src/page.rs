@@ -126,13 +126,9 @@ impl View<'_> {
             exact(standing.best.value, standing.best.published)
         });
         add(of_error, "± error", Cell::Empty, &|standing| {
-            let Scored {
-                error,
-                published: own,
-                ..
-            } = standing.best;
+            let own = standing.best.published;
             match self.detail {
-                true => Cell::number(error, own.decimals + 2),
+                true => Cell::number(standing.best.error, own.decimals + 2),
                 false => Cell::number(own.step, own.decimals),
             }
         });
@@ -457,12 +453,7 @@ fn rules(challenge: &Challenge) -> Vec<String> {
 
 // Where to get data and program, and where to send entries, one paragraph each.
 fn take_part(challenge: &Challenge) -> Vec<String> {
-    let Challenge {
-        data,
-        contact,
-        address,
-        ..
-    } = challenge;
+    let data = &challenge.data;
     let place = |place: &str, none: &str| match place.is_empty() {
         true => none.to_owned(),
         false => place.to_owned(),
@@ -471,11 +462,11 @@ fn take_part(challenge: &Challenge) -> Vec<String> {
         format!(
             "Data ({}): {}",
             volume(data),
-            place(address, "ask the organiser")
+            place(&challenge.address, "ask the organiser")
         ),
         format!(
             "Entries and questions: {}",
-            place(contact, "to the organiser")
+            place(&challenge.contact, "to the organiser")
         ),
         format!(
             "Any program may measure the shapes. shearq ({}) {}, and checks it without the true shear: README.md beside the images has the commands.",
@@ -602,12 +593,7 @@ fn grid_sections(challenge: &Challenge) -> String {
 
 // The page for participants, as Markdown.
 pub(crate) fn readme(challenge: &Challenge) -> String {
-    let Challenge {
-        name,
-        version,
-        kind,
-        ..
-    } = challenge;
+    let (name, version, kind) = (&challenge.name, challenge.version, challenge.kind);
     let (task, sections) = match &challenge.data.scene {
         Some(scene) => ("shear of each scene", scene_sections(challenge, scene)),
         None => ("shapes of the galaxies", grid_sections(challenge)),

@@ -556,10 +556,8 @@ pub(crate) mod tests {
         let honest = with("B", 17.9, &pairs, 1.7);
         assert_eq!(ranks(&[cheat, honest.clone()]), [Some(1), Some(2)]);
         // An entry with much noise does not share the first rank, one within the errors does.
-        let (noisy, near) = (
-            with("C", 10.0, &[10.0], 15.0),
-            with("D", 16.0, &[16.0], 1.7),
-        );
+        let noisy = with("C", 10.0, &[10.0], 15.0);
+        let near = with("D", 16.0, &[16.0], 1.7);
         assert_eq!(ranks(&[honest, noisy, near]), [Some(1), Some(1), Some(3)]);
     }
 

@@ -64,13 +64,9 @@ pub const KEYS: [&str; 12] = [
 
 /// Key and value that state the pixel axes.
 pub fn frame_entry(frame: &PixelFrame) -> (String, String) {
-    let PixelFrame {
-        angle,
-        mirrored,
-        shear: [g1, g2],
-    } = frame;
-    let parity = if *mirrored { -1 } else { 1 };
-    let text = format!("{angle:.2} {parity} {g1:.4} {g2:.4}");
+    let parity = if frame.mirrored { -1 } else { 1 };
+    let [g1, g2] = frame.shear;
+    let text = format!("{:.2} {parity} {g1:.4} {g2:.4}", frame.angle);
     (CATALOGUE_FRAME.into(), text)
 }
 

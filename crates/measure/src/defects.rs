@@ -693,10 +693,8 @@ fn pair_means(stamp: &[f32], n: usize, at: usize) -> [f32; PAIRS.len()] {
 
 /// The pixel (dx, dy) from a pixel; NaN off the stamp.
 fn offset_pixel(stamp: &[f32], n: usize, at: usize, (dx, dy): (isize, isize)) -> f32 {
-    let (x, y) = (
-        (at % n).wrapping_add_signed(dx),
-        (at / n).wrapping_add_signed(dy),
-    );
+    let x = (at % n).wrapping_add_signed(dx);
+    let y = (at / n).wrapping_add_signed(dy);
     match x < n && y < n {
         true => stamp[y * n + x],
         false => f32::NAN,

@@ -792,10 +792,8 @@ impl Examination {
     /// A warning if many stamps come near this value, at which pixels saturate.
     pub(crate) fn near_saturation(&self, level: f64) -> Option<Warning> {
         let is_near = |stamp: &&StampStatistics| stamp.peak > NEAR_SATURATION * level;
-        let (count, of) = (
-            self.stamps.iter().filter(is_near).count(),
-            self.stamps.len(),
-        );
+        let count = self.stamps.iter().filter(is_near).count();
+        let of = self.stamps.len();
         let is_many = count as f64 > FLAT_TOPS * of as f64;
         (level > 0.0 && is_many).then_some(Warning::NearSaturation { level, count, of })
     }
@@ -883,10 +881,8 @@ impl Examination {
             apart.is_significant() && apart.value.abs() > 0.5 * own.abs().max(other.abs())
         };
         let blank = self.blank.saturating_sub(first.blank);
-        let (count, of) = (
-            pairs.iter().filter(differs).count() + blank,
-            pairs.len() + blank,
-        );
+        let count = pairs.iter().filter(differs).count() + blank;
+        let of = pairs.len() + blank;
         if lit && count as f64 > OTHER_GALAXIES * of as f64 {
             found.push(Warning::EpochGalaxies { count, of });
         }

@@ -261,10 +261,8 @@ fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet
     const STEP: f64 = 1e-3;
     let steps = [STEP * galaxy.flux_error, STEP];
     let at = |i: i32, j: i32| {
-        let (flux, size) = (
-            galaxy.flux + f64::from(i) * steps[0],
-            galaxy.size + f64::from(j) * steps[1],
-        );
+        let flux = galaxy.flux + f64::from(i) * steps[0];
+        let size = galaxy.size + f64::from(j) * steps[1];
         weight(flux / galaxy.flux_error, flux, size)
     };
     let middle = at(0, 0);

@@ -216,10 +216,8 @@ fn products(spectrum: &mut Spectrum, kernel: &Spectrum) {
     for at in (0..spectrum.0.len() / 4).step_by(LANES) {
         let mut out = [[0.0f32; LANES]; 4];
         {
-            let ([cc, cs, sc, ss], [kcc, kcs, ksc, kss]) = (
-                four_lanes(spectrum.quarters(), at),
-                four_lanes(kernel.quarters(), at),
-            );
+            let [cc, cs, sc, ss] = four_lanes(spectrum.quarters(), at);
+            let [kcc, kcs, ksc, kss] = four_lanes(kernel.quarters(), at);
             for l in 0..LANES {
                 out[0][l] = (cc[l] * kcc[l] + ss[l] * kss[l]) - (sc[l] * ksc[l] + cs[l] * kcs[l]);
                 out[1][l] = (cc[l] * kcs[l] + cs[l] * kcc[l]) - (ss[l] * ksc[l] + sc[l] * kss[l]);
@@ -685,10 +683,8 @@ impl ToModes {
         let lines = lines.chunks_exact_mut(2 * band * self.columns);
         let halves = folded.chunks_exact(self.folding.len() / 2);
         for ((lines, folded), table) in lines.zip(halves).zip(&self.across) {
-            let (folded, table) = (
-                Matrix::new(folded, stride),
-                Matrix::new(table, self.columns),
-            );
+            let folded = Matrix::new(folded, stride);
+            let table = Matrix::new(table, self.columns);
             multiply(folded, table, half, lines, self.columns);
         }
     }
@@ -760,10 +756,8 @@ impl ToModes {
             }
         }
         for ((folded, table), out) in [&*sums, differences].into_iter().zip(&self.across).zip(out) {
-            let (folded, table) = (
-                Matrix::new(folded, stride),
-                Matrix::new(table, self.columns),
-            );
+            let folded = Matrix::new(folded, stride);
+            let table = Matrix::new(table, self.columns);
             multiply(folded, table, half, out, self.width);
         }
     }

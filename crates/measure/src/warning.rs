@@ -767,10 +767,8 @@ fn are_tails(counts: DefectCounts, stamps: usize) -> bool {
     let DefectCounts { dark, bright, .. } = counts;
     let few = f64::from(counts.total()) <= MAX_TAIL_PIXELS * stamps as f64;
     // Dead pixels alone are dark, and as many hot ones are no tails.
-    let (least, most) = (
-        BRIGHT_TAILS[0] * f64::from(dark),
-        BRIGHT_TAILS[1] * f64::from(dark),
-    );
+    let least = BRIGHT_TAILS[0] * f64::from(dark);
+    let most = BRIGHT_TAILS[1] * f64::from(dark);
     few && (least..=most).contains(&f64::from(bright)) && dark + bright == counts.total()
 }
 

@@ -734,10 +734,8 @@ impl<P: RoundProfile> Pixels<P> {
         let farthest = corners[0].max(corners[1]).sqrt();
         let smooth_from = plan.smooth_from(&self.profile, farthest);
         let outermost = farthest.min(smooth_from);
-        let (first, last) = (
-            plan.choose(&self.profile, 0.0),
-            plan.choose(&self.profile, outermost),
-        );
+        let first = plan.choose(&self.profile, 0.0);
+        let last = plan.choose(&self.profile, outermost);
         let mut rules = Rules {
             count: 0,
             bounds: [0.0; MAX_RULES],

@@ -213,10 +213,8 @@ fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2];
     let pool = Pool::new(threads)?;
     let sums = pool.in_order(catalogues, |(_, path)| {
         let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
-        let (e1, e2) = (
-            table::numbers(&table, "e1", &path)?,
-            table::numbers(&table, "e2", &path)?,
-        );
+        let e1 = table::numbers(&table, "e1", &path)?;
+        let e2 = table::numbers(&table, "e2", &path)?;
         let mut sums = ([0.0; 2], 0.0);
         for (e1, e2) in e1.iter().zip(e2.iter()) {
             if e1.is_finite() && e2.is_finite() {

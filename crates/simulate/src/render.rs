@@ -394,10 +394,8 @@ impl Grid {
             unfold_rows(up, down, (pair, columns), &mut along_y[..stamp * width]);
         }
 
-        let (up, down) = (
-            &mut even[..lines * self.width],
-            &mut odd[..lines * self.width],
-        );
+        let up = &mut even[..lines * self.width];
+        let down = &mut odd[..lines * self.width];
         let cosines = Matrix::new(&self.cosines_across, self.width);
         let sines = Matrix::new(&self.sines_across, self.width);
         let [re, im] = along_y.each_ref().map(|part| Matrix::new(part, width));

@@ -255,11 +255,9 @@ impl Galaxies {
             found.rows as f64 > MIN_PLACEHOLDER_SHARE * found.of as f64 && !found.is_constant()
         };
         if let Some(found) = repeated(&shears, EQUAL_SHEARS).filter(among_others) {
-            let Repeated {
-                rows, of, value, ..
-            } = found;
             let message = format!(
-                "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat"
+                "subfield {subfield}: {} of {} galaxies have repeated shears, most often {:?}; expected measured values, which do not repeat",
+                found.rows, found.of, found.value
             );
             return Err(
                 FileError::new(file(first), message).hint("10 for a galaxy that was not measured")

@@ -46,9 +46,7 @@ pub(super) fn simulate(
     threads: usize,
     start: &dyn Fn(u64) -> Box<dyn Progress>,
 ) -> Result<Simulated, SimulationError> {
-    let &Simulation {
-        seed, grid, out, ..
-    } = simulation;
+    let (seed, grid, out) = (simulation.seed, simulation.grid, simulation.out);
     if grid > GRID {
         return Err(SimulationError::Grid {
             found: grid,

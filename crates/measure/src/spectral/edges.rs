@@ -237,10 +237,8 @@ fn add_edges(
 ) {
     let [[first_re, first_im], [last_re, last_im]] = levels;
     // a·exp(iφ) + b·exp(−iφ) = (a + b) cos φ + i(a − b) sin φ.
-    let (sum, difference) = (
-        [first[0] + last[0], first[1] + last[1]],
-        [first[0] - last[0], first[1] - last[1]],
-    );
+    let sum = [first[0] + last[0], first[1] + last[1]];
+    let difference = [first[0] - last[0], first[1] - last[1]];
     for x in 0..re.len() {
         let (cos, sin) = (across[0][x], across[1][x]);
         let levels_sum = [first_re[x] + last_re[x], first_im[x] + last_im[x]];

@@ -81,10 +81,8 @@ fn restore_half(
         };
         let (one, two) = (of_psf(&tilt1), of_psf(&tilt2));
         let (ar, ai) = (plus_re + edge1[0][l] - one.0, plus_im + edge1[1][l] - one.1);
-        let (br, bi) = (
-            cross_re + edge2[0][l] - two.0,
-            cross_im + edge2[1][l] - two.1,
-        );
+        let br = cross_re + edge2[0][l] - two.0;
+        let bi = cross_im + edge2[1][l] - two.1;
         let (re, im) = (restore[0][l], restore[1][l]);
         (u_re[l], u_im[l]) = (ur * re - ui * im, ur * im + ui * re);
         (first_re[l], first_im[l]) = (ar * re - ai * im, ar * im + ai * re);

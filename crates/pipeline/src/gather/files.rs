@@ -193,9 +193,7 @@ impl<'a> Images<'a> {
                 (self.begun, self.number) = (self.begun + 1, 1);
                 (self.found, self.others) = (false, Vec::new());
             }
-            let Some(image) = &mut self.now else {
-                continue;
-            };
+            let Some(image) = &mut self.now else { continue };
             let mut origin = Origin {
                 file: &self.files.paths[self.begun - 1],
                 image: self.number,

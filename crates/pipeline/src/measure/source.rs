@@ -712,10 +712,8 @@ fn offsets(
     {
         return Ok(None);
     }
-    let (x, y) = (
-        numbers(&table.columns, x, path)?,
-        numbers(&table.columns, y, path)?,
-    );
+    let x = numbers(&table.columns, x, path)?;
+    let y = numbers(&table.columns, y, path)?;
     let shift = f64::from(table.head.first_pixel) - 1.0;
     let places = x.iter().zip(&*y).map(|(x, y)| (x - shift, y - shift));
     Ok(Some(

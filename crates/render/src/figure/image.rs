@@ -125,10 +125,8 @@ fn draw_panel<B: DrawingBackend>(
     }
     let pixel = IMAGE_SIDE_PX / rows.max(columns) as f64;
     let (width, height) = (pixel * columns as f64, pixel * rows as f64);
-    let (x, bottom) = (
-        left + 0.5 * (IMAGE_SIDE_PX - width),
-        top + 0.5 * (IMAGE_SIDE_PX + height),
-    );
+    let x = left + 0.5 * (IMAGE_SIDE_PX - width);
+    let bottom = top + 0.5 * (IMAGE_SIDE_PX + height);
     let limits = panel.map.limits(panel.image.iter());
     for (row, values) in panel.image.rows().into_iter().enumerate() {
         let y = |row: usize| bottom - row as f64 * pixel;

@@ -814,9 +814,7 @@ fn verdicts_in_bins(result: &BiasResult) -> Vec<String> {
     type OfLimit = (String, [Bins; 3]);
     let mut lines: Vec<OfLimit> = Vec::new();
     for bin in &result.bins[1..] {
-        let Ok(found) = &bin.estimate else {
-            continue;
-        };
+        let Ok(found) = &bin.estimate else { continue };
         for own in compared(found) {
             let title = format!(
                 "{}: |{}| below {:e}",
@@ -1041,9 +1039,7 @@ fn check_bin(checks: &mut Vec<Checked>, bin: &str, found: &Estimate, limit: &Lim
 
 /// Adds a column of the quantities that exceed their limits to the table of a result, whose first column is named `of`.
 pub fn with_failures(table: &mut Table, of: &'static str, checks: &[Checked]) {
-    let Some(place) = table.place(of) else {
-        return;
-    };
+    let Some(place) = table.place(of) else { return };
     table
         .headings
         .push(Heading::new("exceeds", "Exceeds its limit"));

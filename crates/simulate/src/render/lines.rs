@@ -133,11 +133,9 @@ pub(super) fn shift(
     [sum, difference]: [&mut [f32]; 2],
 ) {
     let count = above.len();
-    let (below, x_re, x_im) = (
-        &below[..count],
-        &phases.x_re[..count],
-        &phases.x_im[..count],
-    );
+    let below = &below[..count];
+    let x_re = &phases.x_re[..count];
+    let x_im = &phases.x_im[..count];
     let (sum_re, sum_im) = sum.split_at_mut(count);
     let (difference_re, difference_im) = difference.split_at_mut(count);
     let (sum_im, difference_im) = (&mut sum_im[..count], &mut difference_im[..count]);
