@@ -888,6 +888,12 @@ impl HexLattice {
         2 * self.columns() + 2
     }
 
+    // Lags in half the plane.
+    #[cfg(test)]
+    pub(crate) fn count(self) -> usize {
+        (self.reach + 1) * self.width()
+    }
+
     /// Area in px² of a lag.
     pub fn area(self) -> f64 {
         self.row_spacing * self.spacing()
