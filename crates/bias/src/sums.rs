@@ -565,8 +565,8 @@ mod tests {
                     }
                     plain(layout, &mut expected, pair, &row);
                 }
-                for k in 0..2 {
-                    mixed[k] += row.response[k][1 - k] * row.g[k];
+                for (k, mixed) in mixed.iter_mut().enumerate() {
+                    *mixed += row.response[k][1 - k] * row.g[k];
                 }
             }
             assert_eq!(found, expected, "{layout:?}");
