@@ -432,7 +432,7 @@ impl Worker {
 
     /// Measures a galaxy on its epochs, whose input was checked. `stars` are the common profiles of the noisy stars of their
     /// images.
-    fn measure_epochs<T: Pixel>(
+    fn measure_cuts<T: Pixel>(
         &mut self,
         epochs: &[Epoch<'_, T>],
         stars: &[Option<&Arc<ResidualProfiles>>],
@@ -485,7 +485,7 @@ impl Worker {
                 stars: stars.get(used[at]).copied().flatten(),
             }
         };
-        let (mut found, noise) = self.method.measure_epochs(used.len(), &epoch)?;
+        let (mut found, noise) = self.method.measure_combined(used.len(), &epoch)?;
         if let Some((orientation, _)) = &frame {
             found.turn(&orientation.spin2());
         }
@@ -629,7 +629,7 @@ impl ImageWorker<'_> {
             self.worker.set_psf(one.psf)?;
             return self.worker.measure_stamp(one.stamp, one.noise, true);
         }
-        self.worker.measure_epochs(epochs, stars)
+        self.worker.measure_cuts(epochs, stars)
     }
 
     /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image, or in white noise

@@ -809,7 +809,7 @@ impl<'n> RowJob<'n> {
     /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
     pub fn measure_row(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
         if !self.epochs.is_empty() || self.session.has_offsets {
-            return self.measure_epochs(worker);
+            return self.row_of_epochs(worker);
         }
         match &*self.stamps {
             Pixels::Single(stamps) => self.measure_stamps(worker, stamps.view()),
@@ -847,7 +847,7 @@ impl<'n> RowJob<'n> {
         })
     }
 
-    fn measure_epochs(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
+    fn row_of_epochs(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
         let measurer = &self.session.measurer;
         let jobs: Vec<&RowJob<'n>> = std::iter::once(self).chain(&self.epochs).collect();
         let count = self.session.rows.stamps(self.row).len();

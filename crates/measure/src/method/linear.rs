@@ -342,7 +342,7 @@ impl CutWorker for LinearWorker {
     }
 
     // The plan follows the PSFs, not the galaxy: Σp² is the weighted mean over the PSFs.
-    fn measure_epochs<'a>(
+    fn measure_combined<'a>(
         &mut self,
         count: usize,
         epoch: &dyn Fn(usize) -> CutEpoch<'a>,

@@ -46,7 +46,7 @@ pub(crate) trait CutWorker: Send {
 
     /// Measures a galaxy on the cut stamps of `count` epochs, which are combined before the shape is measured. Returns the
     /// result with the level of the combined noise, for a pixel of the first epoch. PSFs that were set are lost.
-    fn measure_epochs<'a>(
+    fn measure_combined<'a>(
         &mut self,
         _count: usize,
         _epoch: &dyn Fn(usize) -> CutEpoch<'a>,
