@@ -206,6 +206,15 @@ fn options_of(arguments: &Arguments) -> Options {
     }
 }
 
+// Catalogues of shearq have the standard convention. That of other programs is determined from the data.
+fn options_for(arguments: &Arguments, catalogues: &Catalogues, options: Options) -> Options {
+    let stated = arguments.settings.convention;
+    Options {
+        choice: stated.unwrap_or(catalogues.choice()),
+        ..options
+    }
+}
+
 /// The scored sets of a baseline, and the catalogues.
 pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf>)> {
     anyhow::ensure!(
@@ -297,11 +306,7 @@ fn scored_catalogues(
     options: Options,
 ) -> anyhow::Result<(Vec<ScoredSet>, Options)> {
     let sets = sets_of(arguments.sets.as_ref());
-    let options = Options {
-        // Catalogues of shearq have the standard convention. That of other programs is determined from the data.
-        choice: arguments.settings.convention.unwrap_or(catalogues.choice()),
-        ..options
-    };
+    let options = options_for(arguments, catalogues, options);
     let scored = score_catalogues(data, catalogues, sets, options, arguments.threads.number());
     let scored = match &catalogues.description {
         // The cause of an error in a catalogue may be its description, so the message names both.
@@ -509,6 +514,7 @@ fn scored_files(
         stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
         sign: arguments.truth_sign,
     };
+    let options = options_for(arguments, &catalogues, options);
     let threads = arguments.threads.number();
     let scored = [score_files(truth, &catalogues, &reading, options, threads)?];
     Ok((catalogues, reading, scored))

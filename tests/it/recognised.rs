@@ -6,7 +6,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::support::Folder;
+use crate::support::{Folder, shell};
 
 const SIDE: usize = 12;
 const STAMP: usize = 48;
@@ -249,4 +249,45 @@ fn layouts_of_surveys_have_the_values_of_numpy() {
         let rejected = GALAXIES - number(&own["galaxies"]);
         assert_eq!(number(&scored["rows"]["not_finite"]), rejected, "{name}");
     }
+}
+
+#[test]
+fn plain_catalogues_of_shearq_have_its_convention() {
+    let folder = Folder::with_set(2);
+    folder.measure("--submission 48/linear/star");
+    // Metrics and the convention, without the number of the set and its kind.
+    let scored = |line: &str| {
+        let table = folder.run(&format!("{line} --format csv"));
+        let cells = table.lines().nth(1).unwrap().splitn(3, ',').last();
+        cells.unwrap().to_owned()
+    };
+    let measured = scored("score --measured out --wide");
+    let plain = "out/set02/catalogue-001.parquet out/set02/catalogue-002.parquet";
+    let plain = format!("score --truth data/set02/truth.csv {plain}");
+    // 128 galaxies do not determine a convention.
+    assert_eq!(scored(&format!("{plain} --wide")), measured);
+    assert!(!folder.said(&plain).contains("cannot determine the sign"));
+    // Beside a table of another program, columns are recognised: without a response, it is another measurement.
+    let copy = "out/set02/catalogue-001.parquet";
+    folder.write("other.csv", "x,y,e1,e2\n24.5,24.5,0.1,0.1\n");
+    folder.refuses(
+        &format!("score --truth data/set02/truth.csv {copy} other.csv"),
+        "other.csv: its columns are not the columns of",
+    );
+}
+
+#[test]
+fn check_expects_the_images_that_the_data_have() {
+    let folder = Folder::with_set(2);
+    folder.run("simulate --fixed-psf one --images 1 --grid 8 --seed 5 --out more --sets 5");
+    std::fs::rename(folder.at("more/set05"), folder.at("data/set05")).unwrap();
+    folder.measure("--submission 48/linear/star");
+    folder.run("pack --measured out --method OWN --out sent");
+    let check = |options: &str| {
+        let line = format!("shearq check sent {options}");
+        String::from_utf8(shell(folder.root(), &line).stdout).unwrap()
+    };
+    assert!(!check("--data data").contains("[images]"));
+    assert!(check("--grid 8").contains("warning [images]: set 5 has 1 images, and another set 2"));
+    assert!(check("--grid 8 --images 2").contains("set 5 lacks 1 of 2 images: 2"));
 }

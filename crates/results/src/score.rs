@@ -242,11 +242,10 @@ pub fn score_files(
         }
     };
     let session = SetSession::new(grid, Some(shear), options).map_err(&wrong)?;
-    let scored = files.score(&session, options.choice, None)?;
-    Ok(ScoredSet {
-        sign: Some(sign),
-        ..scored
-    })
+    let mut scored = files.score(&session, options.choice, None)?;
+    scored.record.frame = catalogues.frame(PLAIN_SET)?;
+    scored.sign = Some(sign);
+    Ok(scored)
 }
 
 fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
