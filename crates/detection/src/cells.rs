@@ -18,12 +18,12 @@ use crate::detector::{Detector, of_sum_one};
 // with 75 galaxies per arcmin² takes (8 to 12 ms). Where a PSF changes by 5 % in size and 0.03 in ellipticity from the middle of a chip of
 // 4000 px to its edge, neighbouring cells differ by 1 % and 0.006. At their borders c is then up to 4·10⁻³, of opposite signs on both sides
 // (1.4 times the error of the ellipticity, docs/scenes.md).
-const TILES_PER_CELL: [usize; 2] = [2, 1];
+pub(crate) const TILES_PER_CELL: [usize; 2] = [2, 1];
 // Of an exposure with one PSF.
 const WHOLE: [usize; 2] = [usize::MAX; 2];
 // Parts of an exposure along each axis, of which the one with the broadest PSF decides on the widths of the smoothed light and the
 // moments. Chosen by hand.
-const PARTS: usize = 4;
+pub(crate) const PARTS: usize = 4;
 
 /// The cells of an exposure, row by row.
 #[derive(Debug)]
@@ -68,12 +68,8 @@ impl Cells {
     ) -> Result<Self, E> {
         let mut drawn = |step: [usize; 2]| {
             let places = middles(sides, step);
-            let stars = draw(&places)?.into_iter().zip(places);
-            let stars = stars.map(|(star, (x, y))| match of_sum_one(star.view()) {
-                Err(MeasureError::DarkPsf(sum)) => Err(MeasureError::DarkPsfAt { sum, at: [x, y] }),
-                star => star,
-            });
-            stars.collect::<Result<Vec<_>, _>>().map_err(E::from)
+            let stars = draw(&places)?;
+            all_of_sum_one(&stars, &places).map_err(E::from)
         };
         let some = drawn(sides.map(|side| side.div_ceil(PARTS).max(1)))?;
         let sigma = |star: &&Array2<f64>| gaussian_sigma(star.view());
@@ -128,8 +124,21 @@ impl Cells {
     }
 }
 
+/// Stars at places in units of their light.
+pub(crate) fn all_of_sum_one(
+    stars: &[Array2<f64>],
+    places: &[(f64, f64)],
+) -> Result<Vec<Array2<f64>>, MeasureError> {
+    let stars = stars.iter().zip(places);
+    let stars = stars.map(|(star, &(x, y))| match of_sum_one(star.view()) {
+        Err(MeasureError::DarkPsf(sum)) => Err(MeasureError::DarkPsfAt { sum, at: [x, y] }),
+        star => star,
+    });
+    stars.collect()
+}
+
 /// Middles of parts of an exposure that begin in steps, in FITS pixels; the last ones end with the exposure.
-fn middles([width, height]: [usize; 2], step: [usize; 2]) -> Vec<(f64, f64)> {
+pub(crate) fn middles([width, height]: [usize; 2], step: [usize; 2]) -> Vec<(f64, f64)> {
     let along = |side: usize, step: usize| {
         let parts = (0..side.max(1)).step_by(step);
         parts.map(move |first| 0.5 * (first + (first + step).min(side) + 1) as f64)

@@ -8,13 +8,12 @@ use shearq_quantities::fourier::Complex64;
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::DetectionMethod;
 
-use crate::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filters};
+use crate::functionals::{
+    Axes, Covariances, Functionals, KERNELS, Lengths, SquareTransform, light_filters,
+};
 use crate::pixel::DetectedPixel;
-use crate::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
+use crate::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, Values, dot, trace};
 
-// Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it are up to 2·10⁻³ of all, but of a
-// blend behind Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one they change the functionals by 10⁻⁶ of its light.
-const KERNEL_SIGMAS: f64 = 6.5;
 // Two blocks of fewer margins lose most of their pixels.
 const MIN_MARGINS_PER_BLOCK: usize = 8;
 // Pixels a side of a star: more than PSF models have, and less than an exposure that is given in its place.
@@ -24,28 +23,34 @@ const SLACK: f64 = 0.01;
 
 /// What detectors of an exposure have in common, whatever the star.
 #[derive(Debug, Clone)]
-struct Shared {
-    settings: DetectionMethod,
+pub(crate) struct Shared {
+    pub(crate) settings: DetectionMethod,
     noise: StampNoise,
-    lengths: Lengths,
-    pixels: PixelShape,
+    pub(crate) lengths: Lengths,
+    pub(crate) pixels: PixelShape,
     turn: Spin2,
     defects: ExposureDefects,
+}
+
+/// What weights and responses need to know of the noise of functionals.
+#[derive(Debug)]
+pub(crate) struct Constants {
+    pub(crate) steps: Steps,
+    /// Standard deviation of the noise of v₀.
+    pub(crate) light_noise: f64,
+    /// Σ_ab f_ab of these are subtracted from responses.
+    of_shear: [Square; 2],
+    /// The same, added to f.
+    of_psf: Square,
 }
 
 /// Finds the detections of exposures behind a star.
 #[derive(Debug)]
 pub struct Detector {
-    shared: Shared,
+    pub(crate) shared: Shared,
     functionals: Functionals,
     radius: usize,
-    steps: Steps,
-    /// Standard deviation of the noise of v₀.
-    light_noise: f64,
-    /// Σ_ab f_ab of these are subtracted from responses.
-    of_shear: [Square; 2],
-    /// The same, added to f.
-    of_psf: Square,
+    constants: Constants,
     transform: SquareTransform,
     /// That of v₀, and those of the neighbours if they are between pixels.
     light_filters: Vec<Vec<Complex64>>,
@@ -73,6 +78,64 @@ pub struct Tile {
     pub sides: [usize; 2],
 }
 
+impl Constants {
+    pub(crate) fn new(covariances: &Covariances, settings: &DetectionMethod) -> Self {
+        let mut of_psf = covariances.turned;
+        let plain = covariances.plain.as_flattened();
+        for (value, plain) in of_psf.as_flattened_mut().iter_mut().zip(plain) {
+            *value = 0.25 * (*value - plain);
+        }
+        // Of the mean of both covariances: noise of the PSF's shape would make steps of other widths along one axis, and the weight a
+        // function of direction.
+        let deviation =
+            |a: usize| (0.5 * (covariances.plain[a][a] + covariances.turned[a][a])).sqrt();
+        let of_excess = (EXCESS..M00).map(deviation).sum::<f64>() / NEIGHBOURS as f64;
+        let steps = Steps {
+            threshold: settings.threshold * deviation(LIGHT),
+            threshold_half_width: settings.threshold_half_width * deviation(LIGHT),
+            neighbour_half_width: settings.neighbour_half_width * of_excess,
+            neighbour_share: settings.neighbour_share,
+            softening: settings.softening * deviation(M00),
+        };
+        Constants {
+            steps,
+            light_noise: deviation(LIGHT),
+            of_shear: covariances.sheared,
+            of_psf,
+        }
+    }
+}
+
+impl Shared {
+    /// A pixel of functionals and their changes with both components of shear; `None` without a weight.
+    pub(crate) fn pixel(
+        &self,
+        place: [usize; 2],
+        [u, changes @ ..]: &[Values; 3],
+        constants: &Constants,
+    ) -> Option<DetectedPixel> {
+        let steps = &constants.steps;
+        // A light far below zero is no galaxy but a wrong sky, and would be divided by.
+        if u[M00] <= -0.5 * steps.softening {
+            return None;
+        }
+        let (weight, of) = steps.weighted(u)?;
+        let response = [0, 1].map(|k| {
+            [0, 1].map(|g| {
+                dot(&of[k].first, &changes[g]) - trace(&of[k].second, &constants.of_shear[g])
+            })
+        });
+        let e = [0, 1].map(|k| of[k].value + trace(&of[k].second, &constants.of_psf));
+        Some(DetectedPixel {
+            place,
+            weight,
+            e: self.turn.turn(e),
+            response: self.turn.turn_response(response),
+            snr: u[LIGHT] / constants.light_noise,
+        })
+    }
+}
+
 impl Detector {
     /// Detections behind `star`, a stamp centred on the star, in noise. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
     ///
@@ -84,10 +147,22 @@ impl Detector {
         jacobian: Option<&Jacobian>,
         settings: &DetectionMethod,
     ) -> Result<Self, MeasureError> {
+        let star = of_sum_one(star)?;
+        let sigma = gaussian_sigma(star.view());
+        Detector::of_width(&star, sigma, noise, jacobian, settings)
+    }
+
+    /// The same behind a star of sum one, with lengths that are those behind a Gaussian star of this width.
+    pub(crate) fn of_width(
+        star: &Array2<f64>,
+        sigma: f64,
+        noise: &StampNoise,
+        jacobian: Option<&Jacobian>,
+        settings: &DetectionMethod,
+    ) -> Result<Self, MeasureError> {
         if !(noise.sigma() > 0.0 && noise.sigma().is_normal()) {
             return Err(MeasureError::Noise(noise.sigma().to_string()));
         }
-        let star = of_sum_one(star)?;
         let (turn, pixels) = match jacobian {
             Some(jacobian) => {
                 let (orientation, pixels) = jacobian.factors();
@@ -98,7 +173,6 @@ impl Detector {
                 PixelShape::SQUARE,
             ),
         };
-        let sigma = gaussian_sigma(star.view());
         let lengths = Lengths {
             detection_sigma: settings.detection_sigma * sigma,
             moment_sigma: settings.moment_sigma * sigma,
@@ -112,7 +186,7 @@ impl Detector {
             turn,
             defects: ExposureDefects::new(star.view(), noise.sigma()),
         };
-        Ok(Detector::with(&star, shared))
+        Ok(Detector::with(star, shared))
     }
 
     /// The same behind another star, of sum one. Smoothed light and moments have the same widths, and margin and tiles are the same, so
@@ -134,41 +208,20 @@ impl Detector {
             pixels,
             ..
         } = shared;
-        let reach = (KERNEL_SIGMAS * lengths.detection_sigma + lengths.distance as f64)
-            .max(KERNEL_SIGMAS * lengths.moment_sigma);
+        let reach = lengths.reach();
         // Circles on the sky are longer along one axis of the pixels.
         let longest = pixels.stretch.max(1.0 / pixels.stretch) + pixels.skew.abs();
         let radius = (longest * reach).ceil() as usize;
         let margin = radius + 1 + lengths.distance;
         let transform = SquareTransform::new((MIN_MARGINS_PER_BLOCK * margin).next_power_of_two());
-        let functionals = Functionals::new(star.view(), noise, &lengths, pixels, radius);
-        let covariances = &functionals.covariances;
-        let of_shear = covariances.sheared;
-        let mut of_psf = covariances.turned;
-        let plain = covariances.plain.as_flattened();
-        for (value, plain) in of_psf.as_flattened_mut().iter_mut().zip(plain) {
-            *value = 0.25 * (*value - plain);
-        }
-        // Of the mean of both covariances: noise of the PSF's shape would make steps of other widths along one axis, and the weight a
-        // function of direction.
-        let deviation =
-            |a: usize| (0.5 * (covariances.plain[a][a] + covariances.turned[a][a])).sqrt();
-        let of_excess = (EXCESS..M00).map(deviation).sum::<f64>() / NEIGHBOURS as f64;
-        let steps = Steps {
-            threshold: settings.threshold * deviation(LIGHT),
-            threshold_half_width: settings.threshold_half_width * deviation(LIGHT),
-            neighbour_half_width: settings.neighbour_half_width * of_excess,
-            neighbour_share: settings.neighbour_share,
-            softening: settings.softening * deviation(M00),
-        };
+        let functionals =
+            Functionals::new(star.view(), noise, &lengths, &Axes::own(pixels), radius);
+        let constants = Constants::new(&functionals.covariances, &settings);
         Detector {
             light_filters: light_filters(star.view(), &lengths, pixels, &transform),
-            light_noise: deviation(LIGHT),
             functionals,
             radius,
-            steps,
-            of_shear,
-            of_psf,
+            constants,
             transform,
             shared,
         }
@@ -216,7 +269,7 @@ impl Detector {
 
     /// Smoothed light in image units at which a pixel has half of its weight.
     pub fn threshold(&self) -> f64 {
-        self.steps.threshold
+        self.constants.steps.threshold
     }
 
     // Rows and columns of the middle of a block.
@@ -299,7 +352,8 @@ impl Detector {
             }
             self.transform.inverse(image, map, transform);
         }
-        let slack = SLACK * self.light_noise;
+        let slack = SLACK * self.constants.light_noise;
+        let steps = &self.constants.steps;
         let distance = self.shared.lengths.distance;
         for y in outer..outer + 2 * inner {
             // The row in the map of its block.
@@ -321,8 +375,8 @@ impl Detector {
                         light(row - distance, x),
                     ],
                 };
-                if own < self.steps.threshold - self.steps.threshold_half_width - slack
-                    || !self.steps.may_count(own, neighbours(), slack)
+                if own < steps.threshold - steps.threshold_half_width - slack
+                    || !steps.may_count(own, neighbours(), slack)
                 {
                     continue;
                 }
@@ -344,24 +398,9 @@ impl Detector {
     // `None` without a weight, and near missing pixels, which make the sums NaN.
     fn pixel(&self, place: [usize; 2], sums: &[f32; KERNELS]) -> Option<DetectedPixel> {
         let (parts, _) = sums.as_chunks::<COUNT>();
-        let [u, first, second] = [0, 1, 2].map(|k| parts[k].map(f64::from));
-        // A light far below zero is no galaxy but a wrong sky, and would be divided by.
-        if !sums.iter().all(|sum| sum.is_finite()) || u[M00] <= -0.5 * self.steps.softening {
-            return None;
-        }
-        let (weight, of) = self.steps.weighted(&u)?;
-        let changes = [first, second];
-        let response = [0, 1].map(|k| {
-            [0, 1].map(|g| dot(&of[k].first, &changes[g]) - trace(&of[k].second, &self.of_shear[g]))
-        });
-        let e = [0, 1].map(|k| of[k].value + trace(&of[k].second, &self.of_psf));
-        Some(DetectedPixel {
-            place,
-            weight,
-            e: self.shared.turn.turn(e),
-            response: self.shared.turn.turn_response(response),
-            snr: u[LIGHT] / self.light_noise,
-        })
+        let values = [0, 1, 2].map(|k| parts[k].map(f64::from));
+        let is_known = sums.iter().all(|sum| sum.is_finite());
+        is_known.then(|| self.shared.pixel(place, &values, &self.constants))?
     }
 }
 
@@ -385,7 +424,7 @@ pub(crate) fn of_sum_one(star: ArrayView2<'_, f64>) -> Result<Array2<f64>, Measu
 
 /// Σ over a square of `side` pixels, of rows that are `columns` apart, of each pixel times its weights.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn weighted_sums(
+pub(crate) fn weighted_sums(
     pixels: &[f32],
     columns: usize,
     weights: &[[f32; KERNELS]],

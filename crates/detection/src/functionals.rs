@@ -4,9 +4,13 @@ use ndarray::ArrayView2;
 use shearq_measure::StampNoise;
 use shearq_quantities::PixelShape;
 use shearq_quantities::fourier::{Complex64, Planner64};
+use shearq_quantities::linear::{Matrix2, determinant};
 
 use crate::weight::{COUNT, EXCESS, LIGHT, M00, M22, NEIGHBOURS, Square};
 
+// Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it are up to 2·10⁻³ of all, but of a
+// blend behind Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one they change the functionals by 10⁻⁶ of its light.
+const KERNEL_SIGMAS: f64 = 6.5;
 // Of the PSF's transform, below which modes are left out: rounding of single precision.
 const MIN_TRANSFER: f64 = 1e-5;
 
@@ -22,11 +26,58 @@ pub(crate) struct Lengths {
 }
 
 impl Lengths {
+    /// Radius of the circle under the functionals, in the coordinates of [`PixelShape::map`].
+    pub(crate) fn reach(&self) -> f64 {
+        (KERNEL_SIGMAS * self.detection_sigma + self.distance as f64)
+            .max(KERNEL_SIGMAS * self.moment_sigma)
+    }
+
     /// Offsets of the neighbours in the coordinates of [`PixelShape::map`], along which the sky has no other direction: on a lattice of
     /// sheared pixels they would give round galaxies a mean shape.
     pub(crate) fn neighbours(&self) -> [[f64; 2]; NEIGHBOURS] {
         let d = self.distance as f64;
         [[d, 0.0], [-d, 0.0], [0.0, d], [0.0, -d]]
+    }
+}
+
+/// The pixels of an exposure in the coordinates of functionals.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Axes {
+    /// Shape of the pixels of the exposure on whose pixels the functionals are.
+    pub(crate) pixels: PixelShape,
+    /// From offsets in its pixels to those in pixels of this exposure.
+    pub(crate) matrix: Matrix2,
+}
+
+impl Axes {
+    /// Those of the exposure on whose pixels the functionals are.
+    pub(crate) fn own(pixels: PixelShape) -> Self {
+        Axes {
+            pixels,
+            matrix: [[1.0, 0.0], [0.0, 1.0]],
+        }
+    }
+
+    /// Pixels of this exposure along the longer of its axes that a circle of this radius covers on each side of its centre.
+    pub(crate) fn radius(&self, reach: f64) -> usize {
+        let PixelShape { stretch, skew } = self.pixels;
+        let along = |[x, y]: [f64; 2]| (x / stretch).hypot(stretch * y - skew * x);
+        let longest = self.matrix.map(along).into_iter().fold(0.0, f64::max);
+        (longest * reach).ceil() as usize
+    }
+
+    /// Area in pixels of this exposure of a pixel on which functionals are.
+    fn area(&self) -> f64 {
+        determinant(self.matrix).abs()
+    }
+
+    /// A wave vector in radians per pixel of this exposure, in the coordinates of [`PixelShape::map`].
+    fn wave(&self, [kx, ky]: [f64; 2]) -> [f64; 2] {
+        // k · x is the same in all coordinates.
+        let [[xx, xy], [yx, yy]] = self.matrix;
+        let [kx, ky] = [xx * kx + yx * ky, xy * kx + yy * ky];
+        let PixelShape { stretch, skew } = self.pixels;
+        [kx / stretch, stretch * ky - skew * kx]
     }
 }
 
@@ -55,9 +106,8 @@ struct Wave {
 
 impl Wave {
     /// That of a wave vector in radians per pixel.
-    fn new([kx, ky]: [f64; 2], pixels: PixelShape) -> Self {
-        // k · x is the same in both coordinates.
-        let k = [kx / pixels.stretch, pixels.stretch * ky - pixels.skew * kx];
+    fn new(k: [f64; 2], axes: &Axes) -> Self {
+        let k = axes.wave(k);
         Wave {
             k,
             square: k[0] * k[0] + k[1] * k[1],
@@ -223,23 +273,33 @@ fn inverse_transfer(star: ArrayView2<'_, f64>, transform: &SquareTransform) -> V
     out
 }
 
-/// The filter of v₀ at the modes of a transform, with the division by the number of pixels. Those of its neighbours follow if pixels
-/// are not square; otherwise neighbours are pixels.
+/// The filter of v₀ at the modes of a transform, with the division by the number of pixels.
+pub(crate) fn light_filter(
+    star: ArrayView2<'_, f64>,
+    lengths: &Lengths,
+    axes: &Axes,
+    transform: &SquareTransform,
+) -> Vec<Complex64> {
+    let norm = axes.area() / (transform.side * transform.side) as f64;
+    let mut filter = inverse_transfer(star, transform);
+    for (value, k) in filter.iter_mut().zip(transform.waves()) {
+        *value *= norm * Wave::new(k, axes).light(lengths)[0];
+    }
+    filter
+}
+
+/// The same. Those of the neighbours follow if pixels are not square; otherwise neighbours are pixels.
 pub(crate) fn light_filters(
     star: ArrayView2<'_, f64>,
     lengths: &Lengths,
     pixels: PixelShape,
     transform: &SquareTransform,
 ) -> Vec<Vec<Complex64>> {
-    let pixels_inverse = 1.0 / (transform.side * transform.side) as f64;
-    let mut filter = inverse_transfer(star, transform);
-    for (value, k) in filter.iter_mut().zip(transform.waves()) {
-        *value *= pixels_inverse * Wave::new(k, pixels).light(lengths)[0];
-    }
-    let mut filters = vec![filter];
+    let axes = Axes::own(pixels);
+    let mut filters = vec![light_filter(star, lengths, &axes, transform)];
     if !pixels.is_square() {
         for [x, y] in lengths.neighbours() {
-            let waves = transform.waves().map(|k| Wave::new(k, pixels).k);
+            let waves = transform.waves().map(|k| axes.wave(k));
             let moved = filters[0].iter().zip(waves);
             let moved = moved.map(|(own, k)| own * Complex64::cis(k[0] * x + k[1] * y));
             filters.push(moved.collect());
@@ -266,13 +326,39 @@ pub(crate) struct Covariances {
     pub(crate) turned: Square,
 }
 
+impl Covariances {
+    const ZERO: Covariances = Covariances {
+        plain: [[0.0; COUNT]; COUNT],
+        sheared: [[[0.0; COUNT]; COUNT]; 2],
+        turned: [[0.0; COUNT]; COUNT],
+    };
+
+    /// Those of sums of functionals of independent noise, each times its weight.
+    pub(crate) fn of_sum<'a>(parts: impl Iterator<Item = (f64, &'a Self)>) -> Self {
+        let mut sum = Covariances::ZERO;
+        let add = |to: &mut Square, from: &Square, square: f64| {
+            let pairs = to.as_flattened_mut().iter_mut().zip(from.as_flattened());
+            pairs.for_each(|(to, from)| *to += square * from);
+        };
+        for (weight, own) in parts {
+            let square = weight * weight;
+            add(&mut sum.plain, &own.plain, square);
+            add(&mut sum.turned, &own.turned, square);
+            for g in 0..2 {
+                add(&mut sum.sheared[g], &own.sheared[g], square);
+            }
+        }
+        sum
+    }
+}
+
 impl Functionals {
     /// The functionals behind a star in noise, from the square of 2 `radius` + 2 pixels whose pixel `radius` along both axes is the pixel itself.
     pub(crate) fn new(
         star: ArrayView2<'_, f64>,
         noise: &StampNoise,
         lengths: &Lengths,
-        pixels: PixelShape,
+        axes: &Axes,
         radius: usize,
     ) -> Self {
         let side = 2 * radius + 2;
@@ -284,8 +370,8 @@ impl Functionals {
         );
         let inverse = inverse_transfer(star, &transform);
         let n = transform.side;
-        let norm = 1.0 / (n * n) as f64;
-        let filters = transform.waves().map(|k| Wave::new(k, pixels).all(lengths));
+        let (norm, area) = (1.0 / (n * n) as f64, axes.area());
+        let filters = transform.waves().map(|k| Wave::new(k, axes).all(lengths));
         let filters: Vec<[[Complex64; 3]; COUNT]> = filters.collect();
         let mut kernels = vec![[0.0f32; KERNELS]; side * side];
         let mut plane = vec![Complex64::default(); n * n];
@@ -299,17 +385,13 @@ impl Functionals {
             transform.inverse(&mut plane, &mut out, &mut scratch);
             for (at, weights) in kernels.iter_mut().enumerate() {
                 let [y, x] = [at / side, at % side].map(|at| (at + n - radius) % n);
-                weights[kernel] = (norm * out[y * n + x].re) as f32;
+                weights[kernel] = (area * norm * out[y * n + x].re) as f32;
             }
         }
-        let mut covariances = Covariances {
-            plain: [[0.0; COUNT]; COUNT],
-            sheared: [[[0.0; COUNT]; COUNT]; 2],
-            turned: [[0.0; COUNT]; COUNT],
-        };
+        let mut covariances = Covariances::ZERO;
         let power = |k: [f64; 2]| {
             let (power, _) = noise.power(k, PixelShape::SQUARE);
-            norm * noise.sigma().powi(2) * power
+            area * area * norm * noise.sigma().powi(2) * power
         };
         for ((filters, inverse), k) in filters.iter().zip(&inverse).zip(transform.waves()) {
             let power = power(k);
@@ -363,7 +445,8 @@ mod tests {
             moment_sigma: 3.0,
             distance: 3,
         };
-        Functionals::new(star.view(), &StampNoise::white(1.0), &lengths, pixels, 12).covariances
+        let axes = Axes::own(pixels);
+        Functionals::new(star.view(), &StampNoise::white(1.0), &lengths, &axes, 12).covariances
     }
 
     #[test]

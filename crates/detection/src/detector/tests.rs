@@ -87,8 +87,8 @@ fn without_noise(threshold: f64) -> Detector {
     let settings = DetectionMethod::default();
     let known = Detector::new(star().view(), &StampNoise::white(NOISE), None, &settings).unwrap();
     let settings = DetectionMethod {
-        threshold: threshold / known.light_noise,
-        threshold_half_width: 0.3 * threshold / known.light_noise,
+        threshold: threshold / known.constants.light_noise,
+        threshold_half_width: 0.3 * threshold / known.constants.light_noise,
         softening: 1e6,
         ..settings
     };
@@ -147,8 +147,8 @@ fn light_beyond_the_square_of_the_kernels_changes_no_moment() {
         let star = psf.stamp(64);
         let own = Detector::new(star.view(), &noise, None, &DetectionMethod::default()).unwrap();
         let (radius, wide) = (own.radius, 30);
-        let pixels = PixelShape::SQUARE;
-        let all = Functionals::new(star.view(), &noise, &own.shared.lengths, pixels, wide);
+        let axes = Axes::own(PixelShape::SQUARE);
+        let all = Functionals::new(star.view(), &noise, &own.shared.lengths, &axes, wide);
         let side = 2 * wide + 2;
         // A galaxy of stars with Gaussian weights, and one of half its light beside it.
         let mut image = Array2::<f64>::zeros((side, side));
@@ -255,7 +255,7 @@ fn noise_changes_neither_responses_nor_shapes() {
             let plain = at(&clean);
             let here = noisy(&clean);
             let (parts, _) = here.as_chunks::<COUNT>();
-            let weighted = detector.steps.weighted(&parts[0].map(f64::from));
+            let weighted = detector.constants.steps.weighted(&parts[0].map(f64::from));
             for k in 0..2 {
                 let of = |g: usize| at(&moved[g]).map_or(0.0, |own| own.e[k]);
                 let slope = (of(2 * k) - of(2 * k + 1)) / (2.0 * h);
@@ -406,7 +406,7 @@ fn noise_of_an_elliptical_psf_has_no_shape() {
     };
     let detector = Detector::new(star.view(), &StampNoise::white(1.0), None, &settings).unwrap();
     let mut without = Detector::new(star.view(), &StampNoise::white(1.0), None, &settings).unwrap();
-    without.of_psf = [[0.0; COUNT]; COUNT];
+    without.constants.of_psf = [[0.0; COUNT]; COUNT];
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let mut sums = [[0.0; 2]; 2];
     const IMAGES: usize = 24;
