@@ -22,6 +22,7 @@
 
 mod cells;
 mod detector;
+mod epochs;
 mod functionals;
 mod groups;
 mod pixel;
@@ -32,5 +33,6 @@ mod weight;
 
 pub use cells::Cells;
 pub use detector::{DetectionScratch, Detector, Tile};
+pub use epochs::{Epoch, EpochCells, EpochDetector, EpochScratch, MAX_EPOCHS, Patch};
 pub use groups::Detections;
 pub use pixel::{DetectedPixel, Detection};
