@@ -56,6 +56,8 @@ pub struct Epoch<'a, E> {
     pub is_constant: bool,
     /// The places on it, in FITS pixels, of places on the first exposure; `None` for those that it cannot have. Not used of the first one.
     pub places: Box<Places<'a, E>>,
+    /// What is wrong with it or its stars.
+    pub fault: Box<dyn Fn(MeasureError) -> E + 'a>,
 }
 
 impl<E> std::fmt::Debug for Epoch<'_, E> {
@@ -67,7 +69,7 @@ impl<E> std::fmt::Debug for Epoch<'_, E> {
     }
 }
 
-impl<E: From<MeasureError>> Epoch<'_, E> {
+impl<E> Epoch<'_, E> {
     /// Stars at places of the first exposure.
     fn stars_at(&mut self, places: &[Option<[f64; 2]>]) -> Result<Vec<Array2<f64>>, E> {
         let middle = self.sides.map(|side| 0.5 * (side as f64 + 1.0));
@@ -79,7 +81,7 @@ impl<E: From<MeasureError>> Epoch<'_, E> {
         let count = if self.is_constant { 1 } else { places.len() };
         let places: Vec<(f64, f64)> = places[..count].iter().map(inside).collect();
         let stars = (self.stars)(&places)?;
-        Ok(all_of_sum_one(&stars, &places)?)
+        all_of_sum_one(&stars, &places).map_err(&self.fault)
     }
 
     /// Offsets in pixels of this epoch of those in pixels of the first one, near places.
@@ -162,20 +164,20 @@ impl EpochCells {
     /// Detections on the pixels of the first of some epochs.
     ///
     /// # Errors
-    /// Those of the epochs; if there are none or more than [`MAX_EPOCHS`]; and as [`Detector::new`].
-    pub fn new<E: From<MeasureError>>(
+    /// Those of the epochs, and as [`Detector::new`].
+    ///
+    /// # Panics
+    /// If there are none, or more than [`MAX_EPOCHS`].
+    pub fn new<E>(
         mut epochs: Vec<Epoch<'_, E>>,
         jacobian: Option<&Jacobian>,
         settings: &DetectionMethod,
     ) -> Result<Self, E> {
-        if !(1..=MAX_EPOCHS).contains(&epochs.len()) {
-            return Err(MeasureError::Shape {
-                what: "the list of exposures",
-                found: format!("{}", epochs.len()),
-                expected: format!("1 to {MAX_EPOCHS} of one sky"),
-            }
-            .into());
-        }
+        assert!(
+            (1..=MAX_EPOCHS).contains(&epochs.len()),
+            "{} epochs",
+            epochs.len()
+        );
         let sides = epochs[0].sides;
         epochs[0].places = Box::new(|places| Ok(places.iter().copied().map(Some).collect()));
         let some = middles(sides, sides.map(|side| side.div_ceil(PARTS).max(1)));
@@ -187,7 +189,8 @@ impl EpochCells {
             let stars = epoch.stars_at(&places)?;
             let sigma = |star: &Array2<f64>| gaussian_sigma(star.view());
             let broadest = stars.iter().max_by(|a, b| sigma(a).total_cmp(&sigma(b)));
-            let broadest = broadest.ok_or(MeasureError::DarkPsf(0.0))?;
+            let broadest = broadest.ok_or(MeasureError::DarkPsf(0.0));
+            let broadest = broadest.map_err(&epoch.fault)?;
             let scale = matrices
                 .first()
                 .map_or(1.0, |own| determinant(*own).abs().sqrt());
@@ -198,8 +201,10 @@ impl EpochCells {
         // Behind the broadest of all, sharper epochs would lose what they resolve.
         let sigma = upper_median(&mut sigmas).unwrap_or_default();
         let noise = epochs[0].noise.clone();
-        let star = first.ok_or(MeasureError::DarkPsf(0.0))?;
-        let shared = Detector::of_width(&star, sigma, &noise, jacobian, settings)?;
+        let shared = first.ok_or(MeasureError::DarkPsf(0.0));
+        let shared = shared
+            .and_then(|star| Detector::of_width(&star, sigma, &noise, jacobian, settings))
+            .map_err(&epochs[0].fault)?;
         let tile = [shared.columns_per_tile(), shared.rows_per_tile()];
         let tiles = [0, 1].map(|k| sides[k].div_ceil(tile[k]));
         let tiles_per_cell = if is_constant { tiles } else { TILES_PER_CELL };
@@ -222,14 +227,16 @@ impl EpochCells {
         Ok(cells)
     }
 
-    fn plan<E: From<MeasureError>>(
+    fn plan<E>(
         &self,
         is_first: bool,
         mut epoch: Epoch<'_, E>,
         middles: &[[f64; 2]],
     ) -> Result<EpochPlan, E> {
         if !(epoch.noise.sigma() > 0.0 && epoch.noise.sigma().is_normal()) {
-            return Err(MeasureError::Noise(epoch.noise.sigma().to_string()).into());
+            return Err((epoch.fault)(MeasureError::Noise(
+                epoch.noise.sigma().to_string(),
+            )));
         }
         let places = (epoch.places)(middles)?;
         let stars = epoch.stars_at(&places)?;
@@ -279,7 +286,7 @@ impl EpochCells {
     }
 
     // The maps of all blocks, row by row.
-    fn maps<E: From<MeasureError>>(
+    fn maps<E>(
         &self,
         is_first: bool,
         epoch: &mut Epoch<'_, E>,
@@ -332,7 +339,7 @@ impl EpochCells {
         self.epochs[0].matrices.len()
     }
 
-    /// Rows and columns of tiles.
+    /// Tiles along each row and column.
     pub fn tiles(&self) -> [usize; 2] {
         [
             self.columns[1],

@@ -3,19 +3,23 @@
 //! Rows of tiles are read one after the other and detected in threads. Tiles depend on the exposure alone, so that the detections
 //! are the same for any number of threads, and memory does not grow with the height of an exposure.
 
-use std::collections::BTreeMap;
+use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use ndarray::{Array2, ArrayView2};
-use shearq_dataset::fingerprint::{GALAXIES, PSF, of_image};
+use shearq_dataset::fingerprint::{Fingerprint, GALAXIES, PSF, of_image};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, frame_entry};
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Progress;
-use shearq_detection::{Cells, DetectedPixel, Detection, Detections, Detector, Tile};
+pub use shearq_detection::MAX_EPOCHS;
+use shearq_detection::{
+    Cells, DetectedPixel, Detection, Detections, Detector, Epoch, EpochCells, EpochDetector, Patch,
+    Tile,
+};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
 use shearq_files::frames::{Metadata, frame};
@@ -32,27 +36,35 @@ use shearq_submissions::{
 use crate::PipelineError;
 use crate::engine;
 use crate::gather::{
-    Chip, Exposure, Files, Masks, PlaneReader, PsfModel, another, lose, truncation,
+    Chip, Exposure, Files, Masks, Origin, PlaneReader, PsfModel, another, lose, truncation,
 };
 use crate::measure::metadata;
 use crate::wcs::{Wcs, aligned};
 
-/// An exposure to detect galaxies on.
-#[derive(Debug, Clone)]
-pub struct DetectionTask<'a> {
+/// An exposure with its PSF.
+#[derive(Debug, Clone, Copy)]
+pub struct EpochFiles<'a> {
     pub exposure: Files<'a>,
     /// A stamp of the star, at its centre, or a model of the PSF by position.
     pub psf: Files<'a>,
     pub masks: Option<Masks<'a>>,
     /// Standard deviation of a pixel; that of the header key NOISESIG, or measured with its correlation, if `None`.
     pub noise: Option<f64>,
+}
+
+/// Exposures of one sky to detect galaxies on, those on the pixels of the first one.
+#[derive(Debug, Clone)]
+pub struct DetectionTask<'a> {
+    /// At least one, and at most [`MAX_EPOCHS`].
+    pub epochs: Vec<EpochFiles<'a>>,
     /// The axes of ellipticities; the sky's if the WCS has other axes than the pixels, unless it is given.
     pub frame: Option<Frame>,
     pub settings: DetectionMethod,
 }
 
-// In a catalogue's metadata: the standard deviation of a pixel and where it is from, the fingerprint of the mask, and the bits that
-// make a pixel missing.
+// In a catalogue's metadata: the number of several exposures, the standard deviation of a pixel of each and where it is from, the
+// fingerprint of the masks, and the bits that make a pixel missing.
+const EPOCHS: &str = "epochs";
 const NOISE: &str = "noise";
 const NOISE_SOURCE: &str = "noisesource";
 const MASK: &str = "mask";
@@ -77,8 +89,8 @@ pub struct Detected {
     pub margin: usize,
     /// Parts of the exposure, each with the PSF at its middle; 1 if it does not vary.
     pub cells: usize,
-    /// Standard deviation of a pixel, and whether it was measured.
-    pub noise: f64,
+    /// Standard deviation of a pixel of each exposure, and whether one was measured.
+    pub noise: Vec<f64>,
     pub is_measured: bool,
     pub frame: Frame,
     pub missing: usize,
@@ -203,9 +215,7 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
         }
         .into());
     }
-    let mut left = height;
-    let (mut found, mut of_row) = (Detections::default(), Vec::<DetectedPixel>::new());
-    let mut unlit = 0;
+    let (mut rows, mut unlit) = (Rows::new([width, height], shared), 0);
     engine::ordered(
         threads,
         |feeder| {
@@ -241,20 +251,94 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
         },
         |(pixels, of_tile, is_last)| {
             unlit += of_tile;
-            of_row.extend(pixels);
-            if is_last {
-                of_row.sort_unstable_by_key(|pixel| [pixel.place[1], pixel.place[0]]);
-                for pixel in of_row.drain(..) {
-                    found.add(&pixel);
-                }
-                let rows = shared.rows_per_tile().min(left);
-                left -= rows;
-                progress.advance((rows * width) as u64);
-            }
+            rows.add(pixels, is_last, progress);
             Ok(())
         },
     )?;
-    Ok((found.finish(), unlit))
+    Ok((rows.found.finish(), unlit))
+}
+
+/// Detects galaxies on several exposures of one sky. Returns the numbers of pixels that are missing, and of those that hold no light, too.
+/// `open` is called in another thread and returns a function that reads the pixels of a patch. Progress is in pixels.
+pub fn detect_epochs<R: FnMut(&Patch) -> Result<Vec<f32>, PipelineError>>(
+    threads: usize,
+    cells: &EpochCells,
+    sides: [usize; 2],
+    open: impl FnOnce() -> Result<R, PipelineError> + Send,
+    progress: &mut dyn Progress,
+) -> Result<(Vec<Detection>, [usize; 2]), PipelineError> {
+    let (mut rows, mut lost) = (Rows::new(sides, cells.shared()), [0; 2]);
+    engine::ordered(
+        threads,
+        |feeder| {
+            let mut read = open()?;
+            let mut detectors: Vec<Arc<EpochDetector>> = Vec::new();
+            let [columns, rows] = cells.tiles();
+            for tile in (0..rows).flat_map(|y| (0..columns).map(move |x| [x, y])) {
+                if let Some(row) = cells.beginning(tile[1]).filter(|_| tile[0] == 0) {
+                    let ahead = feeder.ahead();
+                    detectors = ahead.map(row.collect(), |cell| cells.detector(cell));
+                }
+                let patches = cells.patches(tile).into_iter();
+                let read = patches.map(|patch| Ok((patch, read(&patch)?)));
+                let patches = read.collect::<Result<Vec<_>, PipelineError>>()?;
+                let detector = Arc::clone(&detectors[cells.column(tile[0])]);
+                if !feeder.push((detector, tile, patches, tile[0] + 1 == columns)) {
+                    return Ok(());
+                }
+            }
+            Ok(())
+        },
+        || cells.scratch(),
+        |scratch, (detector, tile, mut patches, is_last)| {
+            let mut found = Vec::new();
+            let lost = cells.detect(&detector, tile, &mut patches, scratch, &mut found);
+            Ok((found, lost, is_last))
+        },
+        |(pixels, of_tile, is_last)| {
+            lost = [0, 1].map(|k| lost[k] + of_tile[k]);
+            rows.add(pixels, is_last, progress);
+            Ok(())
+        },
+    )?;
+    Ok((rows.found.finish(), lost))
+}
+
+/// The detections of rows of tiles.
+struct Rows {
+    found: Detections,
+    of_row: Vec<DetectedPixel>,
+    width: usize,
+    /// Rows that are left, and those of a row of tiles.
+    left: usize,
+    per_tile: usize,
+}
+
+impl Rows {
+    fn new([width, height]: [usize; 2], shared: &Detector) -> Self {
+        Rows {
+            found: Detections::default(),
+            of_row: Vec::new(),
+            width,
+            left: height,
+            per_tile: shared.rows_per_tile(),
+        }
+    }
+
+    // Adds the pixels of a tile, of which the last one completes a row.
+    fn add(&mut self, pixels: Vec<DetectedPixel>, is_last: bool, progress: &mut dyn Progress) {
+        self.of_row.extend(pixels);
+        if is_last {
+            self.of_row
+                .sort_unstable_by_key(|pixel| [pixel.place[1], pixel.place[0]]);
+            for pixel in self.of_row.drain(..) {
+                self.found.add(&pixel);
+            }
+            let rows = self.per_tile.min(self.left);
+            self.left -= rows;
+            progress.advance((rows * self.width) as u64);
+        }
+    }
 }
 
 /// Rows of an exposure that overlap.
@@ -313,10 +397,203 @@ fn copy_tile(band: &[f32], width: usize, tile: &Tile, to: &mut Vec<f32>) {
     }
 }
 
+/// An exposure whose noise is known.
+struct Opened<'a> {
+    files: EpochFiles<'a>,
+    origin: Origin<'a>,
+    sides: [usize; 2],
+    wcs: Wcs,
+    /// Stamps of a grid.
+    sample: Vec<f32>,
+    level: NoiseLevel,
+}
+
+/// The pixels of an exposure, NaN where they are missing.
+struct Pixels<'a> {
+    exposure: Exposure<'a>,
+    mask: Option<(Exposure<'a>, Option<u64>)>,
+}
+
+impl Pixels<'_> {
+    fn rows(&mut self, count: usize) -> Result<Vec<f32>, FileError> {
+        let mut pixels = self.exposure.rows(count)?;
+        if let Some((map, bits)) = &mut self.mask {
+            let values: Vec<f64> = map.rows(count)?;
+            lose(&mut pixels, &values, *bits, &map.origin)?;
+        }
+        Ok(pixels)
+    }
+
+    fn square(&mut self, origin: [i64; 2], side: usize) -> Result<Vec<f32>, FileError> {
+        let mut pixels = self.exposure.square_from(origin, side)?;
+        if let Some((map, bits)) = &mut self.mask {
+            let values: Vec<f64> = map.square_from(origin, side)?;
+            lose(&mut pixels, &values, *bits, &map.origin)?;
+        }
+        Ok(pixels)
+    }
+}
+
+/// The PSF of an exposure.
+enum ExposurePsf {
+    Constant(Array2<f64>),
+    Model(PsfModel),
+}
+
+/// The detectors of one exposure, or of several.
+enum Search {
+    One(Cells),
+    Epochs(EpochCells),
+}
+
+impl Search {
+    // Draws stars of models with what is doubtful about these.
+    fn of(
+        opened: &[Opened<'_>],
+        jacobian: Option<&Jacobian>,
+        settings: &DetectionMethod,
+    ) -> Result<(Self, Vec<Option<String>>), PipelineError> {
+        let psfs = opened.iter().map(|own| own.files.psf(&own.wcs));
+        let psfs = psfs.collect::<Result<Vec<_>, FileError>>()?;
+        let doubts: Vec<RefCell<Option<String>>> =
+            opened.iter().map(|_| RefCell::default()).collect();
+        let stars = &|at: usize, places: &[(f64, f64)]| match &psfs[at] {
+            ExposurePsf::Constant(star) => Ok(vec![star.clone(); places.len()]),
+            ExposurePsf::Model(model) => {
+                let framed = model.framed(places);
+                let warning = framed.and_then(|(psf, fine)| truncation(&psf, fine));
+                doubts[at].replace(warning.map(|warning| warning.to_string()));
+                let (path, scale) = (&opened[at].files.psf.paths[0], opened[at].wcs.scale());
+                Ok::<_, PipelineError>(model.stars(path, places, scale)?)
+            }
+        };
+        let first = &opened[0];
+        let search = match (opened, &psfs[0]) {
+            ([one], ExposurePsf::Constant(star)) => {
+                let cells = Cells::constant(star.clone(), &one.level.noise, jacobian, settings);
+                Search::One(cells.map_err(|error| one.fault(error))?)
+            }
+            ([one], ExposurePsf::Model(_)) => {
+                let stars = |places: &[(f64, f64)]| stars(0, places);
+                let cells = Cells::varying(one.sides, &one.level.noise, jacobian, settings, stars);
+                Search::One(cells.map_err(|error| match error {
+                    PipelineError::Measure(error) => one.fault(error),
+                    other => other,
+                })?)
+            }
+            _ => {
+                let mut epochs = Vec::new();
+                for (at, own) in opened.iter().enumerate() {
+                    epochs.push(Epoch {
+                        sides: own.sides,
+                        noise: own.level.noise.clone(),
+                        stars: Box::new(move |places| stars(at, places)),
+                        is_constant: matches!(psfs[at], ExposurePsf::Constant(_)),
+                        places: Box::new(|places| {
+                            let place = |place: &[f64; 2]| own.wcs.place_of(&first.wcs, *place);
+                            Ok(places.iter().map(place).collect())
+                        }),
+                        fault: Box::new(|error| own.fault(error)),
+                    });
+                }
+                Search::Epochs(EpochCells::new(epochs, jacobian, settings)?)
+            }
+        };
+        Ok((
+            search,
+            doubts.into_iter().map(RefCell::into_inner).collect(),
+        ))
+    }
+
+    fn shared(&self) -> &Detector {
+        match self {
+            Search::One(cells) => cells.shared(),
+            Search::Epochs(cells) => cells.shared(),
+        }
+    }
+
+    fn cells(&self) -> usize {
+        match self {
+            Search::One(cells) => cells.stars().len(),
+            Search::Epochs(cells) => cells.count(),
+        }
+    }
+
+    // The stars of an exposure.
+    fn stars(&self, at: usize) -> &[Array2<f64>] {
+        match self {
+            Search::One(cells) => cells.stars(),
+            Search::Epochs(cells) => cells.stars(at),
+        }
+    }
+
+    // Detections, and numbers of pixels that are missing and that hold no light.
+    fn run(
+        &self,
+        threads: usize,
+        opened: &[Opened<'_>],
+        progress: &mut dyn Progress,
+    ) -> Result<(Vec<Detection>, [usize; 2]), PipelineError> {
+        let sides = opened[0].sides;
+        match self {
+            Search::One(cells) => {
+                let missing = AtomicUsize::new(0);
+                let open = || {
+                    let mut reader = opened[0].files.pixels()?;
+                    let missing = &missing;
+                    Ok(move |rows: usize| {
+                        let pixels = reader.rows(rows)?;
+                        let lost = pixels.iter().filter(|pixel| !pixel.is_finite()).count();
+                        missing.fetch_add(lost, Ordering::Relaxed);
+                        Ok(pixels)
+                    })
+                };
+                let (found, unlit) = detect_rows(threads, cells, sides, open, progress)?;
+                Ok((found, [missing.into_inner(), unlit]))
+            }
+            Search::Epochs(cells) => {
+                let files: Vec<EpochFiles<'_>> = opened.iter().map(|own| own.files).collect();
+                let open = move || {
+                    let readers = files.iter().map(|own| own.pixels());
+                    let mut readers = readers.collect::<Result<Vec<_>, PipelineError>>()?;
+                    Ok(move |patch: &Patch| {
+                        Ok(readers[patch.epoch].square(patch.origin, patch.side)?)
+                    })
+                };
+                detect_epochs(threads, cells, sides, open, progress)
+            }
+        }
+    }
+}
+
+impl Opened<'_> {
+    // An error of the exposure or its PSF.
+    fn fault(&self, error: MeasureError) -> PipelineError {
+        match error {
+            MeasureError::Noise(_) => self.origin.fault(&error.to_string()).into(),
+            _ => FileError::with_hint(&self.files.psf.paths[0], &error, error.hint()).into(),
+        }
+    }
+
+    fn doubts(&self, stars: &[Array2<f64>], of_model: Option<String>) -> Vec<String> {
+        let [per_row, rows] = self.sides.map(|side| grid(side).count());
+        let sky = SkyLevel::of(self.sample.len(), |at| {
+            let stamp = at / STAMP_PIXELS;
+            let [x, y] = [stamp % per_row, stamp / per_row].map(|at| at as f64);
+            ([x / per_row as f64, y / rows as f64], self.sample[at])
+        });
+        let level = &self.level;
+        let mut doubts = doubts(stars, sky, level.noise.sigma(), level.measured);
+        doubts.extend(of_model);
+        doubts.extend(self.wcs.doubts().iter().cloned());
+        doubts
+    }
+}
+
 impl DetectionTask<'_> {
     /// The record of catalogues in the folder `out`.
     pub fn run(&self, out: &Path, format: FileFormat) -> Result<Run, FileError> {
-        let exposure = Place::of(&self.exposure.paths[0]).path;
+        let exposure = Place::of(&self.epochs[0].exposure.paths[0]).path;
         let folder = match exposure.parent() {
             Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
             _ => PathBuf::from("."),
@@ -351,35 +628,24 @@ impl DetectionTask<'_> {
         threads: usize,
         start: impl FnOnce(u64) -> Box<dyn Progress>,
     ) -> Result<Detected, PipelineError> {
-        let mut exposure = Exposure::open(self.exposure)?;
-        let sides = exposure.sides()?;
-        let wcs = exposure.wcs()?;
-        if let Some(fault) = wcs.fault().filter(|_| self.frame == Some(Frame::Sky)) {
-            return Err(exposure.origin.fault(&fault).into());
-        }
-        let jacobian = self.jacobian(&wcs, sides, &exposure)?;
-        if let Some(fault) = wcs.fault().filter(|_| jacobian.is_some()) {
-            return Err(exposure.origin.fault(&fault).hint("--frame pixel").into());
-        }
-        let sample = sample(&mut exposure, sides)?;
-        let level = self.noise(&mut exposure, &sample)?;
-        let axes = (&wcs, jacobian.as_ref());
-        let (cells, of_model) = self.cells(&exposure, sides, &level.noise, axes)?;
+        let opened = self.epochs.iter().map(|files| files.open());
+        let opened = opened.collect::<Result<Vec<_>, PipelineError>>()?;
+        let jacobian = self.check_axes(&opened)?;
         let path = run.catalogue(out, id.set, id.image);
-        let print = of_image(&Place::of(&self.exposure.paths[0]).path)?;
-        refuse_other(&path, run.format, &print)?;
-        let missing = AtomicUsize::new(0);
+        let first = &opened[0];
+        let (sides, origin) = (first.sides, first.origin);
+        let (search, of_models) = Search::of(&opened, jacobian.as_ref(), &self.settings)?;
+        let print = self.print(|own| own.exposure.paths.first())?;
+        refuse_other(&path, run.format, print.as_deref().unwrap_or_default())?;
         let mut progress = start((sides[0] * sides[1]) as u64);
-        let open = || self.open(&missing);
-        let found = detect_rows(threads, &cells, sides, open, progress.as_mut());
+        let found = search.run(threads, &opened, progress.as_mut());
         drop(progress);
-        let (found, unlit) = found.map_err(|error| match error {
-            PipelineError::Measure(error) => exposure.origin.fault(&error.to_string()).into(),
+        let (found, [missing, unlit]) = found.map_err(|error| match error {
+            PipelineError::Measure(error) => origin.fault(&error.to_string()).into(),
             other => other,
         })?;
         if found.is_empty() {
-            return Err(exposure
-                .origin
+            return Err(origin
                 .fault("no galaxy was detected (expected some)")
                 .hint("a lower --threshold, or check --noise")
                 .into());
@@ -387,32 +653,151 @@ impl DetectionTask<'_> {
         let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
         // Not before: a folder that a failed detection has claimed would refuse its remedies.
         let _claim = run.claim(out)?;
-        let columns = self::columns(&found, &wcs);
+        let columns = self::columns(&found, &first.wcs);
         let columns = columns.map_err(|error| FileError::new(&path, error))?;
-        let metadata = self.metadata((run, id), print, &level, (frame, &wcs))?;
+        let metadata = self.metadata((run, id), print, &opened, frame)?;
         table::write(&path, run.format, &columns, &metadata)?;
-        let sigma = level.noise.sigma();
-        let [per_row, rows] = sides.map(|side| grid(side).count());
-        let sky = SkyLevel::of(sample.len(), |at| {
-            let stamp = at / STAMP_PIXELS;
-            let [x, y] = [stamp % per_row, stamp / per_row].map(|at| at as f64);
-            ([x / per_row as f64, y / rows as f64], sample[at])
-        });
-        let mut doubts = doubts(cells.stars(), sky, sigma, level.measured);
-        doubts.extend(of_model);
-        doubts.extend(wcs.doubts().iter().cloned());
+        let mut doubts = Vec::new();
+        for ((at, own), of_model) in opened.iter().enumerate().zip(of_models) {
+            let path = own.files.exposure.paths[0].display();
+            let named = |doubt| match opened.len() {
+                1 => doubt,
+                _ => format!("{path}: {doubt}"),
+            };
+            let own = own.doubts(search.stars(at), of_model);
+            doubts.extend(own.into_iter().map(named));
+        }
         doubts.extend(unlit_in_words(unlit));
+        let levels = || opened.iter().map(|own| &own.level);
         Ok(Detected {
             detections: found.len(),
             weight: found.iter().map(|own| own.weight).sum(),
-            margin: cells.shared().margin(),
-            cells: cells.stars().len(),
-            noise: sigma,
-            is_measured: level.source == MEASURED,
+            margin: search.shared().margin(),
+            cells: search.cells(),
+            noise: levels().map(|level| level.noise.sigma()).collect(),
+            is_measured: levels().any(|level| level.source == MEASURED),
             frame,
-            missing: missing.into_inner(),
+            missing,
             doubts,
             unlit,
+        })
+    }
+
+    // The axes of ellipticities, if they are not those of the pixels. Refuses exposures that these and their places need and do not have.
+    fn check_axes(&self, opened: &[Opened<'_>]) -> Result<Option<Jacobian>, FileError> {
+        let first = &opened[0];
+        let fault = |own: &Opened<'_>| Some(own.origin.fault(&own.wcs.fault()?));
+        if let Some(fault) = fault(first).filter(|_| self.frame == Some(Frame::Sky)) {
+            return Err(fault);
+        }
+        let jacobian = self.jacobian(first)?;
+        if let Some(fault) = fault(first).filter(|_| jacobian.is_some()) {
+            return Err(fault.hint("--frame pixel"));
+        }
+        for own in opened.iter().filter(|_| opened.len() > 1) {
+            if let Some(fault) = fault(own) {
+                return Err(fault);
+            }
+            if !own.wcs.has_sky() {
+                let message = "there is no celestial WCS (expected one of each of several exposures, by which their pixels have places on the sky)";
+                return Err(own.origin.fault(message));
+            }
+        }
+        Ok(jacobian)
+    }
+
+    // The fingerprint of a file, or of those of all exposures: the header of a FITS file has no room for one of each.
+    fn print(
+        &self,
+        file: impl for<'e> Fn(&'e EpochFiles<'_>) -> Option<&'e PathBuf>,
+    ) -> Result<Option<String>, FileError> {
+        let files: Vec<Option<&PathBuf>> = self.epochs.iter().map(file).collect();
+        if let [one] = files[..] {
+            let print = one.map(|file| of_image(&Place::of(file).path));
+            return print.transpose();
+        }
+        let mut print = Fingerprint::default();
+        for (at, file) in files.iter().enumerate() {
+            if let Some(file) = file {
+                print.add(at.to_le_bytes());
+                print.add(of_image(&Place::of(file).path)?);
+            }
+        }
+        let is_known = files.iter().any(Option::is_some);
+        Ok(is_known.then(|| print.finish()))
+    }
+
+    // What the catalogue states of its exposures.
+    fn metadata(
+        &self,
+        (run, id): (&Run, ImageId),
+        of_exposure: Option<String>,
+        opened: &[Opened<'_>],
+        frame: Frame,
+    ) -> Result<Metadata, PipelineError> {
+        let of_psf = self.print(|own| own.psf.paths.first())?;
+        let of_mask = self.print(|own| own.masks.as_ref()?.files.paths.first())?;
+        let prints = [(GALAXIES, of_exposure), (PSF, of_psf), (MASK, of_mask)];
+        let prints = prints.into_iter();
+        let prints = prints.filter_map(|(key, print)| Some((key.to_owned(), print?)));
+        let mut metadata = metadata(run, id, prints.collect())?;
+        metadata.insert(CATALOGUE_FIRST_PIXEL.into(), "1".into());
+        let levels = || opened.iter().map(|own| &own.level);
+        let noise: Vec<String> = levels().map(|own| own.noise.sigma().to_string()).collect();
+        let sources: Vec<&str> = levels().map(|own| own.source).collect();
+        metadata.insert(NOISE.into(), noise.join(","));
+        metadata.insert(NOISE_SOURCE.into(), sources.join(","));
+        if opened.len() > 1 {
+            metadata.insert(EPOCHS.into(), opened.len().to_string());
+        }
+        if let Some(bits) = self.epochs[0].masks.and_then(|masks| masks.bits) {
+            metadata.insert(MASK_BITS.into(), bits.to_string());
+        }
+        match (frame, opened[0].wcs.reference()) {
+            (Frame::Sky, _) => {
+                metadata.insert(CATALOGUE_FRAME.into(), Frame::Sky.to_string());
+            }
+            (Frame::Pixel, Some(matrix)) => {
+                metadata.extend([frame_entry(&PixelFrame::from_jacobian(matrix))]);
+            }
+            (Frame::Pixel, None) => {}
+        }
+        Ok(metadata)
+    }
+
+    // That of the middle of the first exposure, if ellipticities are to be along the axes of the sky.
+    fn jacobian(&self, first: &Opened<'_>) -> Result<Option<Jacobian>, FileError> {
+        let middle = first.sides.map(|side| 0.5 * (side as f64 + 1.0));
+        let matrix = first.wcs.jacobian(middle);
+        let origin = &first.origin;
+        let wanted = match (self.frame, &matrix) {
+            (Some(Frame::Sky), None) => {
+                return Err(origin
+                    .fault("there is no WCS (expected one with --frame sky)")
+                    .hint("--frame pixel"));
+            }
+            (Some(frame), _) => frame == Frame::Sky,
+            (None, Some(matrix)) => !aligned(matrix),
+            (None, None) => false,
+        };
+        let matrix = matrix.filter(|_| wanted).map(Jacobian::new).transpose();
+        matrix.map_err(|error| origin.fault(&error.to_string()))
+    }
+}
+
+impl<'a> EpochFiles<'a> {
+    fn open(&self) -> Result<Opened<'a>, PipelineError> {
+        let mut exposure = Exposure::open(self.exposure)?;
+        let sides = exposure.sides()?;
+        let wcs = exposure.wcs()?;
+        let sample = sample(&mut exposure, sides)?;
+        Ok(Opened {
+            files: *self,
+            sides,
+            wcs,
+            level: self.noise(&mut exposure, &sample)?,
+            sample,
+            origin: exposure.origin,
         })
     }
 
@@ -444,78 +829,9 @@ impl DetectionTask<'_> {
         })
     }
 
-    // With what is doubtful about a model of the PSF.
-    fn cells(
-        &self,
-        exposure: &Exposure<'_>,
-        sides: [usize; 2],
-        noise: &StampNoise,
-        (wcs, jacobian): (&Wcs, Option<&Jacobian>),
-    ) -> Result<(Cells, Option<String>), PipelineError> {
-        let (path, settings) = (&self.psf.paths[0], &self.settings);
-        let mut doubt = None;
-        let cells = match PsfModel::read(path, Chip { at: 0, of: 1 })? {
-            None => Cells::constant(self.star(wcs)?, noise, jacobian, settings).map_err(Into::into),
-            Some(model) => Cells::varying(sides, noise, jacobian, settings, |places| {
-                let framed = model.framed(places);
-                let warning = framed.and_then(|(psf, fine)| truncation(&psf, fine));
-                doubt = warning.map(|warning| warning.to_string());
-                Ok::<_, PipelineError>(model.stars(path, places, wcs.scale())?)
-            }),
-        };
-        let cells = cells.map_err(|error| match error {
-            PipelineError::Measure(error @ MeasureError::Noise(_)) => {
-                exposure.origin.fault(&error.to_string()).into()
-            }
-            PipelineError::Measure(error) => {
-                FileError::with_hint(path, &error, error.hint()).into()
-            }
-            other => other,
-        })?;
-        Ok((cells, doubt))
-    }
-
-    // What the catalogue states of its exposure, of which `print` is the fingerprint.
-    fn metadata(
-        &self,
-        (run, id): (&Run, ImageId),
-        print: String,
-        level: &NoiseLevel,
-        (frame, wcs): (Frame, &Wcs),
-    ) -> Result<Metadata, PipelineError> {
-        let masks = self.masks.as_ref();
-        let mask = masks.map(|masks| (MASK, &masks.files.paths[0]));
-        let mut prints = BTreeMap::from([(GALAXIES.to_owned(), print)]);
-        for (key, file) in [(PSF, &self.psf.paths[0])].into_iter().chain(mask) {
-            prints.insert(key.to_owned(), of_image(&Place::of(file).path)?);
-        }
-        let mut metadata = metadata(run, id, prints)?;
-        metadata.insert(CATALOGUE_FIRST_PIXEL.into(), "1".into());
-        metadata.insert(NOISE.into(), level.noise.sigma().to_string());
-        metadata.insert(NOISE_SOURCE.into(), level.source.into());
-        if let Some(bits) = masks.and_then(|masks| masks.bits) {
-            metadata.insert(MASK_BITS.into(), bits.to_string());
-        }
-        match (frame, wcs.reference()) {
-            (Frame::Sky, _) => {
-                metadata.insert(CATALOGUE_FRAME.into(), Frame::Sky.to_string());
-            }
-            (Frame::Pixel, Some(matrix)) => {
-                metadata.extend([frame_entry(&PixelFrame::from_jacobian(matrix))]);
-            }
-            (Frame::Pixel, None) => {}
-        }
-        Ok(metadata)
-    }
-
-    // Reads rows of pixels, NaN where they are missing, which are counted.
-    fn open<'m>(
-        &self,
-        missing: &'m AtomicUsize,
-    ) -> Result<impl FnMut(usize) -> Result<Vec<f32>, PipelineError> + use<'_, 'm>, PipelineError>
-    {
+    fn pixels(&self) -> Result<Pixels<'a>, PipelineError> {
         let mut exposure = Exposure::open(self.exposure)?;
-        let mut mask = match self.masks {
+        let mask = match self.masks {
             None => None,
             Some(masks) => {
                 let mut map = Exposure::open(masks.files)?;
@@ -524,40 +840,16 @@ impl DetectionTask<'_> {
                 Some((map, masks.bits))
             }
         };
-        Ok(move |rows: usize| {
-            let mut pixels: Vec<f32> = exposure.rows(rows)?;
-            if let Some((map, bits)) = &mut mask {
-                let values: Vec<f64> = map.rows(rows)?;
-                lose(&mut pixels, &values, *bits, &map.origin)?;
-            }
-            let lost = pixels.iter().filter(|pixel| !pixel.is_finite()).count();
-            missing.fetch_add(lost, Ordering::Relaxed);
-            Ok(pixels)
-        })
+        Ok(Pixels { exposure, mask })
     }
 
-    // That of the middle of the exposure, if ellipticities are to be along the axes of the sky.
-    fn jacobian(
-        &self,
-        wcs: &Wcs,
-        sides: [usize; 2],
-        exposure: &Exposure<'_>,
-    ) -> Result<Option<Jacobian>, FileError> {
-        let middle = sides.map(|side| 0.5 * (side as f64 + 1.0));
-        let matrix = wcs.jacobian(middle);
-        let wanted = match (self.frame, &matrix) {
-            (Some(Frame::Sky), None) => {
-                return Err(exposure
-                    .origin
-                    .fault("there is no WCS (expected one with --frame sky)")
-                    .hint("--frame pixel"));
-            }
-            (Some(frame), _) => frame == Frame::Sky,
-            (None, Some(matrix)) => !aligned(matrix),
-            (None, None) => false,
-        };
-        let matrix = matrix.filter(|_| wanted).map(Jacobian::new).transpose();
-        matrix.map_err(|error| exposure.origin.fault(&error.to_string()))
+    fn psf(&self, wcs: &Wcs) -> Result<ExposurePsf, FileError> {
+        Ok(
+            match PsfModel::read(&self.psf.paths[0], Chip { at: 0, of: 1 })? {
+                Some(model) => ExposurePsf::Model(model),
+                None => ExposurePsf::Constant(self.star(wcs)?),
+            },
+        )
     }
 
     fn star(&self, wcs: &Wcs) -> Result<Array2<f64>, FileError> {

@@ -24,8 +24,8 @@ pub use self::array::{
     GatheredPixels, HeaderPixels, is_aligned, pixel_difference, scale_difference,
 };
 pub(crate) use self::exposure::Exposure;
-pub(crate) use self::files::PlaneReader;
 pub use self::files::{Content, Files};
+pub(crate) use self::files::{Origin, PlaneReader};
 pub(crate) use self::maps::{another, lose};
 pub(crate) use self::model::{Chip, PsfModel};
 use self::mosaic::{Rows, StampWriter, already};

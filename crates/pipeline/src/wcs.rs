@@ -100,6 +100,15 @@ impl Wcs {
         self.map.as_ref()?.pixel_of(sky)
     }
 
+    /// The pixel that has the place on the sky of a pixel of another image. `None` for those that are not on this one, where a distortion may
+    /// lead back to its pixels.
+    pub(crate) fn place_of(&self, other: &Self, at: [f64; 2]) -> Option<[f64; 2]> {
+        let place = self.pixel(other.sky(at)?)?;
+        let [there, here] = [self.reference()?, self.jacobian(place)?].map(determinant);
+        let is_finite = place.iter().all(|at| at.is_finite());
+        (is_finite && there * here > 0.0).then_some(place)
+    }
+
     /// The projection of a header that is not read.
     pub(crate) fn unread(&self) -> Option<&str> {
         self.unread.as_deref()

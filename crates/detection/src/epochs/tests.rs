@@ -124,6 +124,7 @@ fn cells(epochs: &[TestEpoch], settings: &DetectionMethod) -> EpochCells {
             noise: StampNoise::white(own.noise),
             stars: Box::new(move |places| Ok(vec![own.star(); places.len()])),
             is_constant: true,
+            fault: Box::new(|error| error),
             places: Box::new(move |places| {
                 let place = |at: &[f64; 2]| own.place(at.map(|at| at - 1.0)).map(|at| at + 1.0);
                 Ok(places.iter().map(|at| Some(place(at))).collect())

@@ -101,6 +101,15 @@ impl<'a> Exposure<'a> {
         Ok(())
     }
 
+    /// The square of `side` pixels a side from a column and row on, counted from 0; NaN beyond the image.
+    pub(crate) fn square_from<P: Pixel>(
+        &mut self,
+        [x, y]: [i64; 2],
+        side: usize,
+    ) -> Result<Vec<P>, FileError> {
+        self.reader()?.read_square(x, y, side)
+    }
+
     /// The square of `side` pixels a side whose centre is nearest to a position in FITS pixels; NaN beyond the
     /// image.
     pub(crate) fn square<P: Pixel>(
