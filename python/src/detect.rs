@@ -1,12 +1,12 @@
 //! Detections on an exposure.
 
-use ndarray::s;
-use numpy::{IntoPyArray, PyReadonlyArray2, PyReadonlyArray3};
+use ndarray::{ArrayView1, ArrayView2, s};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_dataset::threads::Quiet;
-use shearq_detection::Cells;
+use shearq_detection::{Cells, Detection, Epoch, EpochCells, MAX_EPOCHS, Patch};
 use shearq_measure::{DetectionMethod, Jacobian, MeasureError, StampNoise};
 use shearq_pipeline::detect::{
     COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, measured_level, unlit_in_words,
@@ -35,31 +35,28 @@ pub(crate) fn detect<'py>(
     jacobian: Option<[[f64; 2]; 2]>,
     threads_asked: Option<u16>,
 ) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
-    let settings = DetectionMethod {
-        threshold,
-        ..DetectionMethod::default()
-    };
-    settings.validate().map_err(|error| {
-        let (found, expected) = (error.found, error.expected);
-        PyValueError::new_err(format!("threshold: found {found}; expected {expected}"))
-    })?;
-    let jacobian = jacobian.map(Jacobian::new).transpose();
-    let jacobian = jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))?;
+    let (settings, jacobian) = (settings(threshold)?, axes(jacobian)?);
     let image = image.as_array();
     let (height, width) = image.dim();
-    let (noise_level, axes) = (StampNoise::white(noise), jacobian.as_ref());
+    let (noise_level, jacobian) = (StampNoise::white(noise), jacobian.as_ref());
     let cells = match psf.extract::<PyReadonlyArray2<'_, f64>>() {
         Ok(star) => {
             let star = star.as_array().to_owned();
-            Cells::constant(star, &noise_level, axes, &settings).map_err(Fault::from)
+            Cells::constant(star, &noise_level, jacobian, &settings).map_err(Fault::from)
         }
-        Err(_) => Cells::varying([width, height], &noise_level, axes, &settings, |places| {
-            let drawn = psf.call1((places.to_vec(),)).map_err(Fault)?;
-            let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>();
-            let drawn = drawn.map_err(Fault)?;
-            let stars = drawn.as_array();
-            Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
-        }),
+        Err(_) => Cells::varying(
+            [width, height],
+            &noise_level,
+            jacobian,
+            &settings,
+            |places| {
+                let drawn = psf.call1((places.to_vec(),)).map_err(Fault)?;
+                let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>();
+                let drawn = drawn.map_err(Fault)?;
+                let stars = drawn.as_array();
+                Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
+            },
+        ),
     };
     let cells = cells.map_err(|Fault(error)| error)?;
     let found = py.detach(|| {
@@ -75,6 +72,29 @@ pub(crate) fn detect<'py>(
         detect_rows(threads, &cells, [width, height], open, &mut Quiet)
     });
     let (found, unlit) = found.map_err(of_pipeline)?;
+    let mut doubts = doubts(cells.stars(), sky_of(&image), noise, measured_level(image));
+    doubts.extend(unlit_in_words(unlit));
+    Ok((columns(py, &found)?, doubts))
+}
+
+fn settings(threshold: f64) -> PyResult<DetectionMethod> {
+    let settings = DetectionMethod {
+        threshold,
+        ..DetectionMethod::default()
+    };
+    settings.validate().map_err(|error| {
+        let (found, expected) = (error.found, error.expected);
+        PyValueError::new_err(format!("threshold: found {found}; expected {expected}"))
+    })?;
+    Ok(settings)
+}
+
+fn axes(jacobian: Option<[[f64; 2]; 2]>) -> PyResult<Option<Jacobian>> {
+    let jacobian = jacobian.map(Jacobian::new).transpose();
+    jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))
+}
+
+fn columns<'py>(py: Python<'py>, found: &[Detection]) -> PyResult<Bound<'py, PyDict>> {
     let columns = PyDict::new(py);
     for (name, of) in PLACE.iter().chain(&COLUMNS) {
         let values: Vec<f64> = found.iter().map(of).collect();
@@ -84,12 +104,105 @@ pub(crate) fn detect<'py>(
         let values: Vec<i32> = found.iter().map(|own| of(own) as i32).collect();
         columns.set_item(name, values.into_pyarray(py))?;
     }
-    let sky = SkyLevel::of(width * height, |at| {
+    Ok(columns)
+}
+
+fn sky_of(image: &ArrayView2<'_, f32>) -> Option<SkyLevel> {
+    let (height, width) = image.dim();
+    SkyLevel::of(width * height, |at| {
         let (x, y) = (at % width, at / width);
         let place = [x as f64 / width as f64, y as f64 / height as f64];
         (place, image[[y, x]])
+    })
+}
+
+/// The same of several images of one sky, each with its PSF and noise. `places` are functions from arrays of places (n, 2) on the first image,
+/// in FITS pixels, to those on each, NaN where there are none.
+#[pyfunction]
+pub(crate) fn detect_epochs<'py>(
+    py: Python<'py>,
+    images: Vec<PyReadonlyArray2<'py, f32>>,
+    psfs: Vec<Bound<'py, PyAny>>,
+    noises: Vec<f64>,
+    places: Vec<Bound<'py, PyAny>>,
+    threshold: f64,
+    jacobian: Option<[[f64; 2]; 2]>,
+    threads_asked: Option<u16>,
+) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
+    let (settings, jacobian) = (settings(threshold)?, axes(jacobian)?);
+    let images: Vec<ArrayView2<'_, f32>> = images.iter().map(|own| own.as_array()).collect();
+    if !(1..=MAX_EPOCHS).contains(&images.len()) {
+        let found = images.len();
+        let message = format!("image: found {found} exposures; expected 1 to {MAX_EPOCHS}");
+        return Err(PyValueError::new_err(message));
+    }
+    let sides = |at: usize| [images[at].ncols(), images[at].nrows()];
+    let mut epochs = Vec::new();
+    for (at, (psf, places)) in psfs.iter().zip(&places).enumerate() {
+        let star = psf.extract::<PyReadonlyArray2<'_, f64>>().ok();
+        let star = star.map(|star| star.as_array().to_owned());
+        epochs.push(Epoch {
+            sides: sides(at),
+            noise: StampNoise::white(noises[at]),
+            is_constant: star.is_some(),
+            stars: Box::new(move |places| match &star {
+                Some(star) => Ok(vec![star.clone(); places.len()]),
+                None => {
+                    let drawn = psf.call1((places.to_vec(),))?;
+                    let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>()?;
+                    let stars = drawn.as_array();
+                    Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
+                }
+            }),
+            places: Box::new(move |on_first| {
+                let given: Vec<f64> = on_first.iter().flatten().copied().collect();
+                let given = PyArray1::from_vec(py, given).reshape([on_first.len(), 2])?;
+                let found = places.call1((given,))?;
+                let found = found.extract::<PyReadonlyArray2<'_, f64>>()?;
+                let place = |row: ArrayView1<'_, f64>| {
+                    (row[0].is_finite() && row[1].is_finite()).then_some([row[0], row[1]])
+                };
+                Ok(found.as_array().outer_iter().map(place).collect())
+            }),
+            fault: Box::new(move |error| {
+                let error = of_measuring(error);
+                PyValueError::new_err(format!("{} (exposure {})", error.value(py), at + 1))
+            }),
+        });
+    }
+    let cells = EpochCells::new(epochs, jacobian.as_ref(), &settings)?;
+    let found = py.detach(|| {
+        let open = || {
+            Ok(|patch: &Patch| {
+                let image = &images[patch.epoch];
+                let pixel = |at: usize| {
+                    let [x, y] = [at % patch.side, at / patch.side].map(|at| at as i64);
+                    let at = [y + patch.origin[1], x + patch.origin[0]].map(usize::try_from);
+                    let [Ok(y), Ok(x)] = at else {
+                        return f32::NAN;
+                    };
+                    image.get([y, x]).copied().unwrap_or(f32::NAN)
+                };
+                Ok((0..patch.side * patch.side).map(pixel).collect())
+            })
+        };
+        let threads = threads(threads_asked);
+        shearq_pipeline::detect::detect_epochs(threads, &cells, sides(0), open, &mut Quiet)
     });
-    let mut doubts = doubts(cells.stars(), sky, noise, measured_level(image));
-    doubts.extend(unlit_in_words(unlit));
-    Ok((columns, doubts))
+    let (found, [_, unlit]) = found.map_err(of_pipeline)?;
+    let mut all = Vec::new();
+    for (at, image) in images.iter().enumerate() {
+        let own = doubts(
+            cells.stars(at),
+            sky_of(image),
+            noises[at],
+            measured_level(*image),
+        );
+        all.extend(
+            own.into_iter()
+                .map(|doubt| format!("exposure {}: {doubt}", at + 1)),
+        );
+    }
+    all.extend(unlit_in_words(unlit));
+    Ok((columns(py, &found)?, all))
 }

@@ -28,7 +28,7 @@ mod _shearq {
     #[pymodule_export]
     use super::command::run_command;
     #[pymodule_export]
-    use super::detect::detect;
+    use super::detect::{detect, detect_epochs};
     #[pymodule_export]
     use super::images::{
         are_aligned, header_pixels, pixel_difference_of, read_images, stated_oversampling,

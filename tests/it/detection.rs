@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::support::{Folder, assert_has, contents};
+use crate::support::{Folder, assert_has, contents, pixels_of};
 
 /// The whole way, which has the signs of shear and response, the noise of the response, and places that move with the shear.
 #[test]
@@ -131,5 +131,78 @@ fn what_an_exposure_lacks_is_said() {
     folder.refuses(
         "detect --exposure empty/psf.fits --psf empty/psf.fits --out out",
         "the noise cannot be measured (expected an exposure with blank sky",
+    );
+}
+
+#[test]
+fn exposures_of_one_sky_are_combined() {
+    let folder = Folder::new();
+    folder.run("simulate --scenes 1 --side 600 --border 60 --seed 3 --density 40 --psf-shape 0,0 --constant-shear 0,0 --opposite-noise --out scenes");
+    let [first, other] = ["g1_+0_g2_+0", "g1_+0_g2_+0_noise"].map(|own| format!("scenes/{own}"));
+    let (pixels, width) = pixels_of(&folder.at(&format!("{other}/scene-001.fits")));
+    // Axes are exchanged, and the first ten columns are missing.
+    let pixel = |at: usize| pixels[(at % (width - 10) + 10) * width + at / (width - 10)];
+    let turned: Vec<f32> = (0..width * (width - 10)).map(pixel).collect();
+    let step = 0.2 / 3600.0;
+    let card = |key: &str, value: f64| format!("{key:<8}= {value:>20.12}");
+    let mut cards = vec![
+        "CTYPE1  = 'RA---TAN'".to_owned(),
+        "CTYPE2  = 'DEC--TAN'".to_owned(),
+    ];
+    let values = [
+        ("CRPIX1", 290.5),
+        ("CRPIX2", 300.5),
+        ("CRVAL1", 150.0),
+        ("CRVAL2", 0.0),
+        ("CD1_2", -step),
+        ("CD2_1", step),
+        ("NOISESIG", 1.0),
+    ];
+    cards.extend(values.map(|(key, value)| card(key, value)));
+    let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+    let sides = [width - 10, width];
+    folder.image("turned.fits", &sides, &cards, &turned);
+    folder.image("plain.fits", &sides, &cards[..2], &turned);
+    let mut mask = vec![0.0f32; sides[0] * sides[1]];
+    mask[300 * sides[0] + 200] = 1.0;
+    folder.image("mask.fits", &sides, &[], &mask);
+    let psf = format!("--psf {first}/psf.fits");
+    let detect = format!("detect --exposure {first}/scene-001.fits");
+    let alone = folder.json(&format!("{detect} {psf} --out alone"));
+    let both = format!("{detect} turned.fits {psf}");
+    let found = folder.json(&format!("{both} --threads 1 --out one"));
+    folder.run(&format!("{both} --threads 3 --out three"));
+    let [one, three] = ["one", "three"].map(|name| contents(&folder.at(name)));
+    assert!(one == three && one.len() == 2, "{} files", one.len());
+    assert_eq!((&alone["epochs"], &found["epochs"]), (&1.into(), &2.into()));
+    assert_eq!(found["noise"], serde_json::json!([1.0, 1.0]));
+    // The threshold is lower by the root of two.
+    let rows = |found: &serde_json::Value| found["detections"].as_f64().unwrap();
+    assert!(rows(&found) > 1.1 * rows(&alone), "{alone} {found}");
+    folder.run("mean --measured one");
+    // Places, parity and shapes: noise of both cancels, and ellipticities are those of one.
+    let shape = |name: &str| {
+        let table = format!("{name}/set01/catalogue-001.parquet");
+        let own = folder.json(&format!("bias {table} --g1 0 --g2 0 --where \"snr > 60\""));
+        [&own["rows"][0]["c1"], &own["rows"][0]["c2"]].map(|own| own.as_f64().unwrap())
+    };
+    for (own, other) in shape("alone").into_iter().zip(shape("one")) {
+        assert!((own - other).abs() < 0.02, "{own} {other}");
+    }
+    let masked = folder.json(&format!(
+        "{detect} turned.fits {psf} --mask mask.fits mask.fits --out masked"
+    ));
+    assert_eq!(masked["missing"], 1);
+    folder.refuses(
+        &format!("{detect} plain.fits {psf} --out none"),
+        "plain.fits: image 1, plane 1: there is no celestial WCS (expected one of each of several exposures",
+    );
+    folder.refuses(
+        &format!("{both} {first}/psf.fits {first}/psf.fits --out none"),
+        "--psf has 3 files for 2 exposures (expected one for each, in the same order)",
+    );
+    folder.refuses(
+        &format!("{both} --mask mask.fits --out none"),
+        "--mask has 1 file for 2 exposures",
     );
 }

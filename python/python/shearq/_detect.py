@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,12 +38,70 @@ def _stars(psf: Any, draw: Callable[..., Any], wcs: WcsLike | None) -> Callable[
     return stars
 
 
+def _places(first: Any, own: Any) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """A function that returns the places in FITS pixels that one WCS has where another one has places."""
+    both = (first, own)
+    if all(hasattr(wcs, "world_to_pixel_values") for wcs in both):
+
+        def of_astropy(places: NDArray[np.float64]) -> NDArray[np.float64]:
+            world = first.pixel_to_world_values(*(places - 1.0).T)
+            return np.ascontiguousarray(np.stack(own.world_to_pixel_values(*world), axis=-1) + 1.0, dtype=np.float64)
+
+        return of_astropy
+    if all(hasattr(wcs, "toWorld") for wcs in both):
+        import galsim
+
+        def of_galsim(places: NDArray[np.float64]) -> NDArray[np.float64]:
+            found = (own.toImage(first.toWorld(galsim.PositionD(x, y))) for x, y in places)
+            return np.array([(at.x, at.y) for at in found], dtype=np.float64).reshape(-1, 2)
+
+        return of_galsim
+    raise ValueError("wcs: found Jacobians or WCSs of several kinds; expected those of astropy or of GalSim for several exposures, by which their pixels have places on the sky")
+
+
+def _each(name: str, value: Any, count: int) -> list[Any]:
+    """One value for each exposure, from one for all or a list."""
+    if not isinstance(value, (list, tuple)):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name}: found {len(value)}; expected {count}, one for each exposure")
+    return list(value)
+
+
+def _pixels(image: ArrayLike, mask: ArrayLike | None) -> NDArray[np.float32]:
+    pixels = shaped("image", with_missing("image", image, mask), "(ny, nx)", axes=2)
+    return np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
+
+
+def _star(psf: Any, wcs: WcsLike | None) -> Any:
+    """A stamp of the PSF, or a function that draws it."""
+    draw = _draw_of(psf)
+    if draw is not None:
+        return _stars(psf, draw, wcs)
+    star = double("psf", psf)
+    if star.ndim != 2:
+        raise ValueError(f"psf: found an array of shape {shown(star.shape)}; expected (py, px)")
+    if not np.isfinite(star).all():
+        raise ValueError("psf: found a pixel that is not finite; expected finite ones")
+    return star
+
+
+def _level(noise: float) -> float:
+    return real("noise", noise, "a positive number of image units", least=0.0)
+
+
+def _local(wcs: WcsLike | None, pixels: NDArray[np.float32]) -> list[list[float]] | None:
+    """The Jacobian of a WCS in the middle of an image."""
+    rows, columns = pixels.shape
+    return None if wcs is None else _jacobians(wcs, np.array([[(columns + 1) / 2, (rows + 1) / 2]]))[0].tolist()
+
+
 def detect(
-    image: ArrayLike,
+    image: ArrayLike | Sequence[ArrayLike],
     psf: Any,
     *,
-    noise: float,
-    mask: ArrayLike | None = None,
+    noise: float | Sequence[float],
+    mask: ArrayLike | Sequence[ArrayLike | None] | None = None,
     wcs: WcsLike | None = None,
     threshold: float = 6.0,
     threads: int | None = None,
@@ -54,20 +112,25 @@ def detect(
     image whose response to shear is known in closed form, so that the mean shear is calibrated with its detection. Pixels with a
     weight that touch each other are a row of the catalogue.
 
+    Of a list of exposures of one sky, the light at each place is combined before the detection, with weights by the noise behind the PSF of
+    each. They may be dithered, rotated and mirrored, have other pixels, and be partly beyond each other. Their fluxes need one zero point.
+
     Parameters
     ----------
-    image : array of shape (ny, nx)
-        The exposure, without sky. Pixels that are masked, not finite or −1e30 are missing: nothing is detected near them.
+    image : array of shape (ny, nx), or list of them
+        The exposure, without sky. Pixels that are masked, not finite or −1e30 are missing: nothing is detected near them, unless another
+        exposure of a list has them. Detections are on the pixels of the first one.
     psf : array of shape (py, px), model, or function of (x, y)
         The PSF of the exposure as a stamp that is centred on the star. If it varies: a model of Piff, PSFEx or Rubin, or a function
         that returns an image or a profile of GalSim at a place in FITS pixels, as for :func:`measure`. It is drawn at the middle of
-        each part of about 400 pixels a side, in which it is taken as constant.
-    noise : float
-        Standard deviation of the noise of a pixel, which has to be white and of one level.
+        each part of about 400 pixels a side, in which it is taken as constant. One for all exposures, or a list.
+    noise : float, or list of floats
+        Standard deviation of the noise of a pixel, which has to be white and of one level. One for all exposures, or a list.
     mask : array of shape (ny, nx), optional
-        True for missing pixels.
+        True for missing pixels. Of several exposures a list, in which None is a mask without missing pixels.
     wcs : array of shape (2, 2), or WCS of GalSim or astropy, optional
-        As for :func:`measure`, at the middle of the image: shapes and responses are then in the frame of the sky.
+        As for :func:`measure`, at the middle of the image: shapes and responses are then in the frame of the sky. Several exposures need a
+        list of WCSs of GalSim or astropy, and have the frame of the sky of the first one.
     threshold : float
         S/N of the smoothed light at which a pixel has half of its weight.
     threads : int, optional
@@ -95,20 +158,23 @@ def detect(
     >>> shearq.detect(image, psf, noise=1.0)
     <shearq.Catalogue of 1 galaxies, 0 flagged: x, y, e1, e2, R11, R22, R12, R21, selection, snr, flags, pixels>
     """
-    pixels = shaped("image", with_missing("image", image, mask), "(ny, nx)", axes=2)
-    draw = _draw_of(psf)
-    star = double("psf", psf) if draw is None else _stars(psf, draw, wcs)
-    if isinstance(star, np.ndarray) and star.ndim != 2:
-        raise ValueError(f"psf: found an array of shape {shown(star.shape)}; expected (py, px)")
-    if isinstance(star, np.ndarray) and not np.isfinite(star).all():
-        raise ValueError("psf: found a pixel that is not finite; expected finite ones")
-    level = real("noise", noise, "a positive number of image units", least=0.0)
-    rows, columns = pixels.shape
-    local = None
-    if wcs is not None:
-        local = _jacobians(wcs, np.array([[(columns + 1) / 2, (rows + 1) / 2]]))[0].tolist()
-    single = np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
-    found, doubts = _shearq.detect(single, star, level, float(threshold), local, thread_count(threads))
+    if isinstance(image, (list, tuple)) and len(image) > 0 and np.ndim(image[0]) == 2:
+        count = len(image)
+        frames = list(wcs) if isinstance(wcs, (list, tuple)) else [wcs]
+        given = sum(own is not None for own in frames)
+        if not given == len(frames) == count:
+            raise ValueError(f"wcs: found {given}; expected {count}, one for each exposure")
+        masks = [None] * count if mask is None else _each("mask", mask, count)
+        images = [_pixels(*pair) for pair in zip(image, masks)]
+        stars = [_star(*pair) for pair in zip(_each("psf", psf, count), frames)]
+        levels = [_level(own) for own in _each("noise", noise, count)]
+        places = [_places(frames[0], own) for own in frames]
+        local = _local(frames[0], images[0])
+        found, doubts = _shearq.detect_epochs(images, stars, levels, places, float(threshold), local, thread_count(threads))
+    else:
+        single = _pixels(image, mask)
+        local = _local(wcs, single)
+        found, doubts = _shearq.detect(single, _star(psf, wcs), _level(noise), float(threshold), local, thread_count(threads))
     for doubt in doubts:
         warn(f"{doubt}.", DataWarning)
     catalogue = np.empty(len(found["e1"]), dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)

@@ -61,6 +61,15 @@ def detect(
     jacobian: list[list[float]] | None,
     threads_asked: int,
 ) -> tuple[dict[str, NDArray[Any]], list[str]]: ...
+def detect_epochs(
+    images: list[NDArray[np.float32]],
+    psfs: list[_Doubles | Callable[[list[tuple[float, float]]], _Doubles]],
+    noises: list[float],
+    places: list[Callable[[_Doubles], _Doubles]],
+    threshold: float,
+    jacobian: list[list[float]] | None,
+    threads_asked: int,
+) -> tuple[dict[str, NDArray[Any]], list[str]]: ...
 def metrics() -> list[tuple[str, str, str]]: ...
 def galaxies(
     catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[tuple[str, str]]]],
