@@ -18,7 +18,6 @@ use ndarray::Array2;
 use shearq_measure::parts::{ExposureDefects, gaussian_sigma};
 use shearq_measure::{MeasureError, StampNoise};
 use shearq_quantities::Jacobian;
-use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::{Matrix2, determinant};
 use shearq_quantities::statistics::upper_median;
 use shearq_submissions::DetectionMethod;
@@ -135,7 +134,8 @@ pub struct EpochCells {
 #[derive(Debug)]
 struct EpochFunctionals {
     functionals: Functionals,
-    light_filter: Vec<Complex64>,
+    /// Of v₀, in single precision, which finds candidates.
+    light_filter: Vec<[f32; 2]>,
     /// One over the variance of v₀.
     weight: f64,
     matrix: Matrix2,
@@ -282,6 +282,16 @@ impl EpochCells {
             is_touched
         })?;
         plan.transform = SquareTransform::new(fast_side(side));
+        // Cells that the epoch does not touch need no functionals.
+        let mut is_touched = vec![false; plan.matrices.len()];
+        for (block, _) in plan.maps.iter().enumerate().filter(|own| own.1.is_some()) {
+            let [column, row] = [block % self.columns[1], block / self.columns[1] / 2];
+            let row = row / self.tiles_per_cell[1];
+            is_touched[row * self.columns[0] + self.column(column)] = true;
+        }
+        for (matrix, is_touched) in plan.matrices.iter_mut().zip(is_touched) {
+            *matrix = matrix.filter(|_| is_touched);
+        }
         Ok(plan)
     }
 
@@ -368,10 +378,13 @@ impl EpochCells {
             let axes = self.axes(matrix);
             let star = epoch.stars.get(cell).unwrap_or(&epoch.stars[0]).view();
             let functionals = Functionals::new(star, &epoch.noise, lengths, &axes, epoch.radius);
+            let light_filter = light_filter(star, lengths, &axes, &epoch.transform);
+            let single = light_filter.iter();
+            let single = single.map(|own| [own.re as f32, own.im as f32]);
             Some(EpochFunctionals {
                 weight: 1.0 / functionals.covariances.plain[LIGHT][LIGHT],
                 functionals,
-                light_filter: light_filter(star, lengths, &axes, &epoch.transform),
+                light_filter: single.collect(),
                 matrix,
             })
         };

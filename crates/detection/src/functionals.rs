@@ -115,6 +115,11 @@ impl Wave {
         }
     }
 
+    /// The transform of a Gaussian.
+    fn smoothed(&self, sigma: f64) -> f64 {
+        (-0.5 * sigma * sigma * self.square).exp()
+    }
+
     /// The filter of a factor under a Gaussian at a place, and those of its changes with shear: −(k_x ∂_x − k_y ∂_y) and
     /// −(k_y ∂_x + k_x ∂_y) of it.
     ///
@@ -123,7 +128,7 @@ impl Wave {
     fn filters(&self, factor: Factor, sigma: f64, at: [f64; 2]) -> [Complex64; 3] {
         let [kx, ky] = self.k;
         let phase = kx * at[0] + ky * at[1];
-        let light = Complex64::from_polar((-0.5 * sigma * sigma * self.square).exp(), phase);
+        let light = Complex64::from_polar(self.smoothed(sigma), phase);
         let phases = [kx * at[0] - ky * at[1], ky * at[0] + kx * at[1]];
         let change = |g: usize| {
             let real = factor.slopes[g] - factor.value * sigma * sigma * self.spin[g];
@@ -283,7 +288,7 @@ pub(crate) fn light_filter(
     let norm = axes.area() / (transform.side * transform.side) as f64;
     let mut filter = inverse_transfer(star, transform);
     for (value, k) in filter.iter_mut().zip(transform.waves()) {
-        *value *= norm * Wave::new(k, axes).light(lengths)[0];
+        *value *= norm * Wave::new(k, axes).smoothed(lengths.detection_sigma);
     }
     filter
 }

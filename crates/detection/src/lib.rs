@@ -16,7 +16,7 @@
 //!
 //! A [`Detector`] works on tiles of two blocks, one below the other, whose middles cover the exposure. v₀ of both blocks, by one
 //! Fourier transform, decides which pixels may have a weight. Their functionals are sums over a square of pixels, which do not
-//! depend on tiles. [`Cells`] have a detector each, of exposures whose PSF varies.
+//! depend on tiles. [`Cells`] have a detector each, of exposures whose PSF varies. [`EpochCells`] are those of several exposures of one sky.
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 

@@ -138,3 +138,56 @@ fn cubic(t: f32) -> [f32; 4] {
         before * t * after / 6.0,
     ]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::close;
+
+    #[test]
+    fn maps_follow_distortions() {
+        // Third derivatives of 10⁻⁹ per px² are ten times those of DECam.
+        let place = |[x, y]: [f64; 2]| {
+            let [u, v] = [x - 4000.0, y - 3000.0];
+            let distortion = |a: f64, b: f64| a * (a * a + b * b) / 6e9;
+            let turned = [0.8 * u - 0.6 * v, 0.6 * u + 0.8 * v];
+            [turned[0] + distortion(u, v), turned[1] + distortion(v, u)]
+        };
+        let (first, step) = ([700.0, 900.0], 100.5);
+        let on_first = |x: f64, y: f64| place([first[0] + x, first[1] + y]);
+        let points: Vec<Option<[f64; 2]>> = (0..9)
+            .map(|k| Some(on_first(step * f64::from(k % 3), step * f64::from(k / 3))))
+            .collect();
+        let map = BlockMap::through(&points, step)
+            .unwrap()
+            .counted_from([5.0, 7.0]);
+        for (x, y) in (0..=200)
+            .step_by(10)
+            .flat_map(|y| [(3.0, y), (90.0, y), (201.0, y)])
+        {
+            let y = f64::from(y);
+            let (own, expected) = (BlockMap::at(&map.row(y), x), on_first(x, y));
+            // From 0, with other first pixels.
+            close(own[0], expected[0] - 6.0, 1e-3);
+            close(own[1], expected[1] - 8.0, 1e-3);
+        }
+        let holed = [&points[..8], &[None]].concat();
+        assert!(BlockMap::through(&holed, step).is_none());
+    }
+
+    #[test]
+    fn polynomials_of_their_order_are_exact() {
+        let weights: [f32; TAPS] = lagrange(0.37);
+        let fifth = |x: f64| (0.1 * x).powi(5) - 0.2 * x;
+        let nodes = (0..TAPS).map(|k| fifth(k as f64 - 5.0));
+        let value: f64 = nodes
+            .zip(weights)
+            .map(|(own, weight)| own * f64::from(weight))
+            .sum();
+        close(value, fifth(0.37), 1e-6);
+        let image: Vec<f32> = (0..100)
+            .map(|k| (k % 10) as f32 + 0.1 * (k / 10) as f32)
+            .collect();
+        close(near_value(&image, 10, [4.25, 6.5]), 4.25 + 0.65, 1e-5);
+    }
+}

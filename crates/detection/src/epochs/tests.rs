@@ -164,17 +164,16 @@ fn found(cells: &EpochCells, images: &[Array2<f32>]) -> Vec<DetectedPixel> {
     found
 }
 
-/// All functionals of an epoch at a pixel of the upper half of the first tile.
+/// All functionals of an epoch at a pixel of the upper half of the first tile, whose patches are given.
 fn sums(
     cells: &EpochCells,
     detector: &EpochDetector,
-    images: &[Array2<f32>],
+    patches: &[(Patch, Vec<f32>)],
     epoch: usize,
     [x, y]: [usize; 2],
 ) -> [f32; KERNELS] {
-    let patches = read(cells, images, [0, 0]);
     let (patch, pixels) = &patches[epoch];
-    assert_eq!(patch.epoch, epoch);
+    assert_eq!((patch.epoch, patch.half), (epoch, 0));
     let half = Half {
         at: epoch,
         plan: &cells.epochs[epoch],
@@ -184,10 +183,8 @@ fn sums(
         light: &[],
         covered: &[],
     };
-    half.sums(
-        BlockMap::at(&patch.map.row(y as f64), x as f64),
-        &mut Default::default(),
-    )
+    let place = BlockMap::at(&patch.map.row(y as f64), x as f64);
+    half.sums(place, &mut Default::default())
 }
 
 fn with_others() -> Vec<TestEpoch> {
@@ -203,11 +200,12 @@ fn functionals_of_rotated_and_dithered_epochs_are_those_of_the_first() {
         .map(|own| own.image([0.0; 2], [0.0; 2]))
         .collect();
     let detector = cells.detector(0);
-    let light = sums(&cells, &detector, &images, 0, [60, 62])[LIGHT];
+    let patches = read(&cells, &images, [0, 0]);
+    let light = sums(&cells, &detector, &patches, 0, [60, 62])[LIGHT];
     for place in [[60, 62], [63, 60], [55, 70], [94, 90]] {
-        let first = sums(&cells, &detector, &images, 0, place);
+        let first = sums(&cells, &detector, &patches, 0, place);
         for epoch in 1..epochs.len() {
-            let own = sums(&cells, &detector, &images, epoch, place);
+            let own = sums(&cells, &detector, &patches, epoch, place);
             for k in 0..KERNELS {
                 // Changes also differ by what the rotated square of an epoch leaves out.
                 let most = if k < COUNT { 3e-5 } else { 2e-4 };
@@ -302,14 +300,15 @@ fn covariances_are_those_of_noise() {
     let own = others()[1];
     let cells = cells(&[FIRST, own], &DetectionMethod::default());
     let detector = cells.detector(0);
-    let blank = [0, 1].map(|_| Array2::zeros((SIDE + 30, SIDE + 20)));
+    let blank = Array2::zeros((SIDE + 30, SIDE + 20));
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let mut sums = [[0.0; COUNT]; KERNELS];
     let mut count = 0.0;
     for _ in 0..160 {
-        let images = [blank[0].clone(), own.noise(&mut rng)];
+        let images = [blank.clone(), own.noise(&mut rng)];
+        let patches = read(&cells, &images, [0, 0]);
         for place in [[40, 60], [80, 60], [60, 95], [95, 95]] {
-            let found = self::sums(&cells, &detector, &images, 1, place);
+            let found = self::sums(&cells, &detector, &patches, 1, place);
             assert!(found.iter().all(|own| own.is_finite()));
             count += 1.0;
             for (a, sums) in sums.iter_mut().enumerate() {
@@ -402,12 +401,13 @@ fn all_pixels_with_a_weight_are_found() {
         .iter()
         .map(|own| (own.weight / total, &own.functionals.covariances));
     let constants = Constants::new(&Covariances::of_sum(of_sum), &settings);
+    let patches = read(&cells, &images, [0, 0]);
     let mut all = Vec::new();
     // Inside of all epochs.
     for (y, x) in (58..92).flat_map(|y| (50..100).map(move |x| (y, x))) {
         let mut values = [[0.0; COUNT]; 3];
         for (epoch, own) in parts.iter().enumerate() {
-            let sums = sums(&cells, &detector, &images, epoch, [x, y]);
+            let sums = sums(&cells, &detector, &patches, epoch, [x, y]);
             for (value, sum) in values.as_flattened_mut().iter_mut().zip(sums) {
                 *value += own.weight / total * f64::from(sum);
             }

@@ -190,8 +190,8 @@ impl EpochCells {
         spectrum.resize(side * side, Complex64::default());
         transform.resize(plan.transform.scratch(), Complex64::default());
         plan.transform.forward(image, spectrum, transform);
-        for (value, filter) in spectrum.iter_mut().zip(&own.light_filter) {
-            *value *= filter;
+        for (value, [re, im]) in spectrum.iter_mut().zip(&own.light_filter) {
+            *value *= Complex64::new((*re).into(), (*im).into());
         }
         plan.transform.inverse(spectrum, image, transform);
         let [upper, lower] = &mut light[epoch];
