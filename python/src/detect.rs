@@ -116,21 +116,26 @@ fn sky_of(image: &ArrayView2<'_, f32>) -> Option<SkyLevel> {
     })
 }
 
-/// The same of several images of one sky, each with its PSF and noise. `places` are functions from arrays of places (n, 2) on the first image,
-/// in FITS pixels, to those on each, NaN where there are none.
+/// An image, its PSF and noise, and a function from an array of places (n, 2) on the first image, in FITS pixels, to those on this one, NaN
+/// where there are none.
+type Exposure<'py> = (
+    PyReadonlyArray2<'py, f32>,
+    Bound<'py, PyAny>,
+    f64,
+    Bound<'py, PyAny>,
+);
+
+/// The same of several images of one sky.
 #[pyfunction]
 pub(crate) fn detect_epochs<'py>(
     py: Python<'py>,
-    images: Vec<PyReadonlyArray2<'py, f32>>,
-    psfs: Vec<Bound<'py, PyAny>>,
-    noises: Vec<f64>,
-    places: Vec<Bound<'py, PyAny>>,
+    exposures: Vec<Exposure<'py>>,
     threshold: f64,
     jacobian: Option<[[f64; 2]; 2]>,
     threads_asked: Option<u16>,
 ) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
     let (settings, jacobian) = (settings(threshold)?, axes(jacobian)?);
-    let images: Vec<ArrayView2<'_, f32>> = images.iter().map(|own| own.as_array()).collect();
+    let images: Vec<ArrayView2<'_, f32>> = exposures.iter().map(|own| own.0.as_array()).collect();
     if !(1..=MAX_EPOCHS).contains(&images.len()) {
         let found = images.len();
         let message = format!("image: found {found} exposures; expected 1 to {MAX_EPOCHS}");
@@ -138,12 +143,12 @@ pub(crate) fn detect_epochs<'py>(
     }
     let sides = |at: usize| [images[at].ncols(), images[at].nrows()];
     let mut epochs = Vec::new();
-    for (at, (psf, places)) in psfs.iter().zip(&places).enumerate() {
+    for (at, (_, psf, noise, places)) in exposures.iter().enumerate() {
         let star = psf.extract::<PyReadonlyArray2<'_, f64>>().ok();
         let star = star.map(|star| star.as_array().to_owned());
         epochs.push(Epoch {
             sides: sides(at),
-            noise: StampNoise::white(noises[at]),
+            noise: StampNoise::white(*noise),
             is_constant: star.is_some(),
             stars: Box::new(move |places| match &star {
                 Some(star) => Ok(vec![star.clone(); places.len()]),
@@ -192,12 +197,8 @@ pub(crate) fn detect_epochs<'py>(
     let (found, [_, unlit]) = found.map_err(of_pipeline)?;
     let mut all = Vec::new();
     for (at, image) in images.iter().enumerate() {
-        let own = doubts(
-            cells.stars(at),
-            sky_of(image),
-            noises[at],
-            measured_level(*image),
-        );
+        let (sky, measured) = (sky_of(image), measured_level(*image));
+        let own = doubts(cells.stars(at), sky, exposures[at].2, measured);
         all.extend(
             own.into_iter()
                 .map(|doubt| format!("exposure {}: {doubt}", at + 1)),

@@ -122,7 +122,7 @@ struct EpochPlan {
 #[derive(Debug)]
 pub struct EpochCells {
     /// With the widths, margin and tiles of all.
-    shared: Detector,
+    shared: Arc<Detector>,
     sides: [usize; 2],
     epochs: Vec<EpochPlan>,
     tiles_per_cell: [usize; 2],
@@ -213,7 +213,7 @@ impl EpochCells {
             epochs: Vec::new(),
             columns: [tiles[0].div_ceil(tiles_per_cell[0]), tiles[0]],
             tiles_per_cell,
-            shared,
+            shared: Arc::new(shared),
         };
         let cell = [0, 1].map(|k| tiles_per_cell[k] * tile[k]);
         let middles = middles(sides, cell)

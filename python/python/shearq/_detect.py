@@ -170,7 +170,9 @@ def detect(
         levels = [_level(own) for own in _each("noise", noise, count)]
         places = [_places(frames[0], own) for own in frames]
         local = _local(frames[0], images[0])
-        found, doubts = _shearq.detect_epochs(images, stars, levels, places, float(threshold), local, thread_count(threads))
+        found, doubts = _shearq.detect_epochs(
+            list(zip(images, stars, levels, places)), float(threshold), local, thread_count(threads)
+        )
     else:
         single = _pixels(image, mask)
         local = _local(wcs, single)

@@ -62,10 +62,14 @@ def detect(
     threads_asked: int,
 ) -> tuple[dict[str, NDArray[Any]], list[str]]: ...
 def detect_epochs(
-    images: list[NDArray[np.float32]],
-    psfs: list[_Doubles | Callable[[list[tuple[float, float]]], _Doubles]],
-    noises: list[float],
-    places: list[Callable[[_Doubles], _Doubles]],
+    exposures: list[
+        tuple[
+            NDArray[np.float32],
+            _Doubles | Callable[[list[tuple[float, float]]], _Doubles],
+            float,
+            Callable[[_Doubles], _Doubles],
+        ]
+    ],
     threshold: float,
     jacobian: list[list[float]] | None,
     threads_asked: int,
