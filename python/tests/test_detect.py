@@ -99,3 +99,61 @@ def test_a_wcs_turns_shapes_to_the_sky() -> None:
 def test_wrong_arguments_are_named(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         shearq.detect(**{"image": np.zeros((60, 60)), "psf": STAR, **arguments})  # type: ignore[arg-type]
+
+
+def _wcs(matrix: list[list[float]], origin: tuple[float, float]) -> object:
+    astropy_wcs = pytest.importorskip("astropy.wcs")
+    wcs = astropy_wcs.WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = [30.0, 10.0]
+    wcs.wcs.crpix = list(origin)
+    wcs.wcs.cd = np.array(matrix) * 0.2 / 3600
+    return wcs
+
+
+def test_exposures_of_one_sky_are_combined() -> None:
+    pixels = image([(100, 70), (180, 150)])
+    # Turned by 180 degrees, with other noise.
+    other = np.ascontiguousarray((image([(100, 70), (180, 150)]) - 0.2 * image([]))[::-1, ::-1])
+    frames = [_wcs([[-1.0, 0.0], [0.0, 1.0]], (130.5, 130.5)), _wcs([[1.0, 0.0], [0.0, -1.0]], (130.5, 130.5))]
+    both = shearq.detect([pixels, other], STAR, noise=[1.0, 0.8], wcs=frames, threads=2)
+    alone = shearq.detect(pixels, STAR, noise=1.0, wcs=frames[0])
+    bright = both[both["selection"] > 5]
+    assert np.allclose(np.sort(bright["x"]), [101, 181], atol=0.7) and both.attrs["frame"] == "sky"
+    assert bright["snr"].min() > 1.2 * alone["snr"][alone["selection"] > 5].min()
+    assert np.allclose(bright["e1"] / bright["R11"], (alone["e1"] / alone["R11"])[alone["selection"] > 5], atol=0.05)
+    # One of them alone, where the other one is masked.
+    nothing = np.ones(pixels.shape, bool)
+    masked = shearq.detect([pixels, other], [STAR, STAR], noise=1.0, mask=[None, nothing], wcs=frames)
+    single = shearq.detect(pixels, STAR, noise=1.0, wcs=frames[0])
+    assert np.allclose(np.sort(masked["x"]), np.sort(single["x"]), atol=1e-3)
+    assert np.isclose(masked["R11"].sum(), single["R11"].sum(), rtol=1e-4)
+
+
+def test_exposures_of_one_sky_by_galsim() -> None:
+    galsim = pytest.importorskip("galsim")
+    pixels = image([(100, 70)])
+    turned = np.ascontiguousarray(pixels.T)
+    frames = [
+        galsim.AffineTransform(-0.2, 0.0, 0.0, 0.2, origin=galsim.PositionD(1, 1)),
+        galsim.AffineTransform(0.0, -0.2, 0.2, 0.0, origin=galsim.PositionD(1, 1)),
+    ]
+    both = shearq.detect([pixels, turned], STAR, noise=1.0, wcs=frames)
+    (bright,) = both[both["selection"] > 5]
+    assert abs(bright["x"] - 101) < 0.7 and abs(bright["y"] - 71) < 0.7 and bright["e1"] > 0
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ({"wcs": None}, "wcs: found 0; expected 2"),
+        ({"wcs": [np.eye(2), np.eye(2)]}, "wcs: found Jacobians"),
+        ({"psf": [STAR]}, "psf: found 1; expected 2"),
+        ({"noise": [1.0, 2.0, 3.0]}, "noise: found 3; expected 2"),
+        ({"psf": [STAR, -STAR]}, r"psf: .*\(exposure 2\)"),
+    ],
+)
+def test_wrong_lists_are_named(arguments: dict[str, object], words: str) -> None:
+    frames = [_wcs([[-1.0, 0.0], [0.0, 1.0]], (30.5, 30.5))] * 2
+    with pytest.raises(ValueError, match=words):
+        shearq.detect(**{"image": [np.zeros((60, 60))] * 2, "psf": STAR, "noise": 1.0, "wcs": frames, **arguments})  # type: ignore[arg-type]

@@ -56,7 +56,10 @@ def _places(first: Any, own: Any) -> Callable[[NDArray[np.float64]], NDArray[np.
             return np.array([(at.x, at.y) for at in found], dtype=np.float64).reshape(-1, 2)
 
         return of_galsim
-    raise ValueError("wcs: found Jacobians or WCSs of several kinds; expected those of astropy or of GalSim for several exposures, by which their pixels have places on the sky")
+    raise ValueError(
+        "wcs: found Jacobians or WCSs of several kinds; expected those of astropy or of GalSim for several exposures, by which their"
+        " pixels have places on the sky"
+    )
 
 
 def _each(name: str, value: Any, count: int) -> list[Any]:
@@ -68,7 +71,7 @@ def _each(name: str, value: Any, count: int) -> list[Any]:
     return list(value)
 
 
-def _pixels(image: ArrayLike, mask: ArrayLike | None) -> NDArray[np.float32]:
+def _pixels(image: Any, mask: Any) -> NDArray[np.float32]:
     pixels = shaped("image", with_missing("image", image, mask), "(ny, nx)", axes=2)
     return np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
 
@@ -86,7 +89,7 @@ def _star(psf: Any, wcs: WcsLike | None) -> Any:
     return star
 
 
-def _level(noise: float) -> float:
+def _level(noise: Any) -> float:
     return real("noise", noise, "a positive number of image units", least=0.0)
 
 

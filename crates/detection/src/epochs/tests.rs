@@ -5,13 +5,20 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_quantities::linear::{apply, product};
 
+use ndarray::Array2;
+use shearq_measure::{MeasureError, StampNoise};
+use shearq_quantities::linear::Matrix2;
+use shearq_submissions::DetectionMethod;
+
+use super::place::BlockMap;
+use super::plan::EpochFunctionals;
 use super::tile::Half;
 use super::*;
 use crate::detector::Constants;
 use crate::functionals::{Covariances, KERNELS};
 use crate::pixel::DetectedPixel;
 use crate::testing::close;
-use crate::weight::COUNT;
+use crate::weight::{COUNT, LIGHT};
 
 const SIDE: usize = 150;
 const GALAXIES: [([f64; 2], f64); 3] = [

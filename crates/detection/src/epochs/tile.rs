@@ -5,16 +5,18 @@ use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::{apply, inverse};
 
 use super::place::{BlockMap, near_value, shift};
-use super::{EpochCells, EpochDetector, EpochFunctionals, EpochPlan, Patch};
+use super::plan::{EpochCells, EpochDetector, EpochFunctionals, EpochPlan, Patch};
 use crate::detector::{Constants, weighted_sums};
 use crate::functionals::{Covariances, KERNELS};
 use crate::pixel::DetectedPixel;
 use crate::weight::COUNT;
 
-// Of a bound, in standard deviations and of v₀: what the cubic interpolation of v₀ may differ by, which is up to 3 % of its noise at a
-// FWHM of 3.5 px, and 7 % of the light of a star at 2 px.
+// Of a bound, in standard deviations of v₀: four times what the cubic interpolation of its noise differs by at a FWHM of 3.5 px, by the fourth
+// derivatives of a Gaussian field.
 const SLACK: f64 = 0.15;
+// Of a bound, in v₀: what its interpolation differs by for a star with a FWHM of 2 px, by fourth derivatives.
 const SLACK_SHARE: f64 = 0.07;
+
 /// Buffers of a thread.
 #[derive(Debug, Default)]
 pub struct EpochScratch {
