@@ -296,10 +296,13 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
 fn program() -> clap::Command {
     fn with_numbers(command: clap::Command) -> clap::Command {
         let is_number = |own: &Arg| own.get_value_parser().type_id() == TypeId::of::<f64>();
+        // Of lists, which end with the next option.
+        let is_list = |own: &Arg| own.get_num_args().is_some_and(|own| own.max_values() > 1);
         command
-            .mut_args(|own| match is_number(&own) {
-                true => own.allow_hyphen_values(true),
-                false => own,
+            .mut_args(|own| match (is_number(&own), is_list(&own)) {
+                (false, _) => own,
+                (true, false) => own.allow_hyphen_values(true),
+                (true, true) => own.allow_negative_numbers(true),
             })
             .mut_subcommands(with_numbers)
     }

@@ -105,6 +105,8 @@ fn negative_and_large_numbers_reach_their_checks() {
         let error = crate::parsed(words(line)).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}");
     }
+    let list = "shearq detect --exposure a b --psf p --noise 1 -2 --out c";
+    assert!(crate::parsed(words(list)).is_ok());
 }
 
 #[test]

@@ -45,6 +45,7 @@ VARIANTS = {
     "stars": ["--stars", "1"],
     "elliptical-psf": ["--psf-shape", "0.04,0.03"],
     "cosmos": [],
+    "epochs": ["--epochs", "3"],
 }
 #: Light of a star above which a pixel is masked, in units of the noise.
 STAR_LIGHT = 0.02
@@ -71,7 +72,8 @@ def detected_sums(options, exposure, mask=None):
     if mask is not None:
         masked = ["--mask", out.with_suffix(".fits")]
         fits.writeto(masked[1], mask, overwrite=True)
-    run(options, "detect", "--exposure", exposure, "--psf", exposure.parent / "psf.fits", "--noise", 1, *masked, "--out", out)
+    epochs = sorted(exposure.parent.glob(f"{exposure.stem}*.fits"), key=lambda path: (len(path.stem), path.stem))
+    run(options, "detect", "--exposure", *epochs, "--psf", exposure.parent / "psf.fits", "--noise", 1, *masked, "--out", out)
     (catalogue,) = out.glob("set01/*.parquet")
     rows = pl.read_parquet(catalogue, columns=["e1", "e2", "R11", "R12", "R21", "R22"])
     shutil.rmtree(out)

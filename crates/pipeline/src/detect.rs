@@ -630,6 +630,7 @@ impl DetectionTask<'_> {
     ) -> Result<Detected, PipelineError> {
         let opened = self.epochs.iter().map(|files| files.open());
         let opened = opened.collect::<Result<Vec<_>, PipelineError>>()?;
+        refuse_copies(&opened)?;
         let jacobian = self.check_axes(&opened)?;
         let path = run.catalogue(out, id.set, id.image);
         let first = &opened[0];
@@ -893,6 +894,21 @@ const NOISE_STAMP: usize = 48;
 const STAMP_PIXELS: usize = NOISE_STAMP * NOISE_STAMP;
 // Largest distance of pixels that may be correlated, as `48/linear/star` has it.
 const MAX_LAG: usize = 3;
+
+// Noise of epochs is taken as independent.
+fn refuse_copies(opened: &[Opened<'_>]) -> Result<(), FileError> {
+    let bits = |own: &Opened<'_>| own.sample.iter().map(|pixel| pixel.to_bits()).collect();
+    let mut seen: Vec<Vec<u32>> = Vec::new();
+    for own in opened.iter().filter(|_| opened.len() > 1) {
+        let pixels = bits(own);
+        if seen.contains(&pixels) {
+            let message = "the same pixels as an earlier exposure (expected each exposure once)";
+            return Err(own.origin.fault(message));
+        }
+        seen.push(pixels);
+    }
+    Ok(())
+}
 
 // Another exposure's catalogue is no earlier result of this one.
 fn refuse_other(path: &Path, format: FileFormat, print: &str) -> Result<(), FileError> {
