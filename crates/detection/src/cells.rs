@@ -1,7 +1,7 @@
 //! A PSF that varies over an exposure, as one that is constant in each of its cells.
 //!
 //! A pixel's weight and ellipticity are functionals of one detector, behind the PSF at the middle of its cell. Their response holds
-//! for each pixel by itself, whatever PSF its neighbours have, so that borders of cells need no care.
+//! for each pixel by itself, whatever PSF its neighbours have, so that borders add no bias on average over a cell.
 
 use std::ops::Range;
 use std::sync::Arc;

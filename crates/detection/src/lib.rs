@@ -1,7 +1,7 @@
 //! Detection whose response to shear is known in closed form.
 //!
 //! Every pixel of an exposure has a weight w between 0 and 1, a product of smooth steps of linear functionals of the deconvolved
-//! image: smoothed light v₀ is above a threshold, and v₀ − v_j above zero for four neighbours j (the idea of AnaCal, Li &
+//! image: smoothed light v₀ is above a threshold, and v₀ − v_j above zero for four neighbours j (as in FPFS and AnaCal, Li &
 //! Mandelbaum 2023, MNRAS 521, 4904). The ellipticity is e = M₂₂/(M₀₀ + C) about the pixel. A shear about the pixel changes a
 //! functional into another linear one, and with f = w e of the functionals u Stein's lemma gives the response without added
 //! noise,

@@ -226,6 +226,12 @@ fn impossible_input_is_an_error() {
     let same = constant_score(&[field; 5], Observation::Ground);
     assert_eq!(same, Err(ScoringError::SameShears));
     assert!(variable_score(&[[0.0; 15]], &[], Observation::Space).is_err());
+    // Fields without a partner on either side, and none.
+    for [sent, of_truth] in [[1, 2], [2, 1], [0, 0]] {
+        let fields = |count: usize| vec![[1e-6; 15]; count];
+        let result = variable_score(&fields(sent), &fields(of_truth), Observation::Space);
+        assert!(matches!(result, Err(ScoringError::Count { found, .. }) if found == sent));
+    }
     assert!(great08::score(&[]).is_err() && great08::score(&[vec![]]).is_err());
     assert!((separations()[3].0 - 0.0853).abs() < 5e-5);
 }
