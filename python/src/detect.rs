@@ -9,7 +9,7 @@ use shearq_dataset::threads::Quiet;
 use shearq_detection::{Cells, Detection, Epoch, EpochCells, MAX_EPOCHS, Patch};
 use shearq_measure::{DetectionMethod, Jacobian, MeasureError, StampNoise};
 use shearq_pipeline::detect::{
-    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, measured_level, unlit_in_words,
+    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, noise_in, noise_of_level, unlit_in_words,
 };
 
 use crate::errors::{of_measuring, of_pipeline};
@@ -38,7 +38,8 @@ pub(crate) fn detect<'py>(
     let (settings, jacobian) = (settings(threshold)?, axes(jacobian)?);
     let image = image.as_array();
     let (height, width) = image.dim();
-    let (noise_level, jacobian) = (StampNoise::white(noise), jacobian.as_ref());
+    let (measured, jacobian) = (noise_in(image), jacobian.as_ref());
+    let noise_level = noise_of_level(noise, measured.as_ref());
     let cells = match psf.extract::<PyReadonlyArray2<'_, f64>>() {
         Ok(star) => {
             let star = star.as_array().to_owned();
@@ -72,7 +73,12 @@ pub(crate) fn detect<'py>(
         detect_rows(threads, &cells, [width, height], open, &mut Quiet)
     });
     let (found, unlit) = found.map_err(of_pipeline)?;
-    let mut doubts = doubts(cells.stars(), sky_of(&image), noise, measured_level(image));
+    let mut doubts = doubts(
+        cells.stars(),
+        sky_of(&image),
+        &noise_level,
+        measured.as_ref(),
+    );
     doubts.extend(unlit_in_words(unlit));
     Ok((columns(py, &found)?, doubts))
 }
@@ -142,13 +148,14 @@ pub(crate) fn detect_epochs<'py>(
         return Err(PyValueError::new_err(message));
     }
     let sides = |at: usize| [images[at].ncols(), images[at].nrows()];
+    let measured: Vec<Option<StampNoise>> = images.iter().map(|image| noise_in(*image)).collect();
     let mut epochs = Vec::new();
     for (at, (_, psf, noise, places)) in exposures.iter().enumerate() {
         let star = psf.extract::<PyReadonlyArray2<'_, f64>>().ok();
         let star = star.map(|star| star.as_array().to_owned());
         epochs.push(Epoch {
             sides: sides(at),
-            noise: StampNoise::white(*noise),
+            noise: noise_of_level(*noise, measured[at].as_ref()),
             is_constant: star.is_some(),
             stars: Box::new(move |places| match &star {
                 Some(star) => Ok(vec![star.clone(); places.len()]),
@@ -197,8 +204,9 @@ pub(crate) fn detect_epochs<'py>(
     let (found, [_, unlit]) = found.map_err(of_pipeline)?;
     let mut all = Vec::new();
     for (at, image) in images.iter().enumerate() {
-        let (sky, measured) = (sky_of(image), measured_level(*image));
-        let own = doubts(cells.stars(at), sky, exposures[at].2, measured);
+        let measured = measured[at].as_ref();
+        let noise = noise_of_level(exposures[at].2, measured);
+        let own = doubts(cells.stars(at), sky_of(image), &noise, measured);
         all.extend(
             own.into_iter()
                 .map(|doubt| format!("exposure {}: {doubt}", at + 1)),

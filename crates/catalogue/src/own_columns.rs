@@ -48,16 +48,25 @@ pub fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
     Ok(())
 }
 
+/// Whether `detect` wrote a catalogue with columns of these names.
+pub fn are_of_detections(names: &[String]) -> bool {
+    [WEIGHT, DETECTED_PIXELS]
+        .iter()
+        .all(|own| names.iter().any(|name| name == own))
+}
+
+/// The error of a catalogue of detections that is cut or weighted by what changes with shear.
+pub fn cut_of_detections(path: &Path) -> FileError {
+    let message = "this catalogue is of detections, whose weights are in e and R: the response of a cut or weight by their columns is not known (expected a catalogue of measure)";
+    FileError::new(path, message).hint("detect with another --threshold")
+}
+
 /// Checks that a catalogue with columns of these names has what a selection requires, and no selection yet.
 pub fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError> {
     refuse_divided(path, names)?;
     let has = |name: &str| names.iter().any(|own| own == name);
-    if has(WEIGHT) && has(DETECTED_PIXELS) {
-        return Err(FileError::new(
-            path,
-            "this catalogue is of detections, whose weights are in e and R: the response of a cut on it is not known (expected a catalogue of measure)",
-        )
-        .hint("detect with another --threshold"));
+    if are_of_detections(names) {
+        return Err(cut_of_detections(path));
     }
     if has(WEIGHT) {
         return Err(

@@ -14,7 +14,9 @@ use shearq_measure::{Observables, Selection};
 use crate::expression::{
     Expression, Operand, RADIANS, operand_values, refuse_long_integers, texts_of, with_names,
 };
-use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
+use crate::own_columns::{
+    SHAPE_COLUMNS, are_of_detections, changes_with_shear, cut_of_detections, require_responses,
+};
 use crate::recognition::{fits_any, has_any, names_of_role, recognition, words};
 
 use crate::columns::{Columns, Names, Preset, Shapes, base, has_operand, may_be_number};
@@ -99,6 +101,8 @@ pub struct Source {
     pub selects: bool,
     /// The column of weights that `select` wrote: rows with zero stay in its files and do not count.
     pub selection: Option<usize>,
+    /// Whether `detect` wrote the catalogue.
+    pub of_detections: bool,
     declines_matrix: bool,
     has_weights: bool,
     /// The signs of e1 and e2 in those of the table: −1 of a formula such as `-e2`. Other columns have the axes of the table.
@@ -854,6 +858,16 @@ fn source(
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
     }
+    let of_detections = columns.is_of_shearq() && are_of_detections(&names);
+    if of_detections {
+        let cuts = reading
+            .condition()
+            .into_iter()
+            .flat_map(Expression::columns);
+        if cuts.chain(columns.of(Role::Weight)).any(changes_with_shear) {
+            return Err(cut_of_detections(path));
+        }
+    }
     let in_rows = sheared.is_some() || columns.of(Role::ShearedCatalogue).is_some();
     check_calibration(path, &columns, in_rows)?;
     if let Units::Column(name) = &reading.request.units {
@@ -938,6 +952,7 @@ fn source(
         sheared_flags,
         selects: columns.give_selection_response() && chosen && known,
         selection,
+        of_detections,
         undivided: columns.undivided(!given.is_given(Role::R11)),
         unreduced,
         declines_matrix: given.decline_matrix(),

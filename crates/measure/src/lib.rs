@@ -108,6 +108,7 @@ pub mod parts {
     };
     pub use crate::spectral::{Lags, Light, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
     pub use crate::transform::HexLattice;
+    pub use crate::warning::significant;
 }
 
 /// The examples of README.md.

@@ -141,6 +141,20 @@ impl StampNoise {
         self.error
     }
 
+    /// Noise of the same correlation and another standard deviation.
+    pub fn at_level(&self, sigma: f64) -> Self {
+        StampNoise {
+            sigma,
+            ..self.clone()
+        }
+    }
+
+    /// Larger of the correlations of pixels so far apart along the two axes.
+    pub fn correlation_along(&self, distance: i32) -> f64 {
+        self.correlation(distance, 0)
+            .max(self.correlation(0, distance))
+    }
+
     /// Correlation of pixels (dx, dy) apart.
     pub fn correlation(&self, dx: i32, dy: i32) -> f64 {
         let (dx, dy) = if dy < 0 { (-dx, -dy) } else { (dx, dy) };

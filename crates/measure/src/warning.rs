@@ -773,7 +773,7 @@ fn are_tails(counts: DefectCounts, stamps: usize) -> bool {
 }
 
 /// A number with `digits` significant digits, in whatever unit pixels have.
-fn significant(value: f64, digits: i32) -> String {
+pub fn significant(value: f64, digits: i32) -> String {
     if value == 0.0 {
         return "0".into();
     }
