@@ -83,7 +83,6 @@ pub struct Layout {
     #[serde(rename = "versions")]
     pub sheared: bool,
     /// Whether rows have the responses R12 of e1 to g2 and R21 of e2 to g1. Then both components are fitted together.
-    // Files of sums before the 2 × 2 response lack it.
     pub matrix: bool,
 }
 
