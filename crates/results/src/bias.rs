@@ -44,9 +44,11 @@ pub struct About {
     version: String,
     pub catalogues: Vec<Catalogue>,
     pub program: String,
+    #[serde(default)]
     pub by_shearq: bool,
     truth: bool,
     // A number that other true shears do not have, of those that are not in the catalogues.
+    #[serde(default)]
     shears: u64,
     /// Whether responses were read, or the type of the ellipticities was given.
     pub response: bool,
@@ -59,12 +61,14 @@ pub struct About {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unreduced: Option<String>,
     /// The column of flags.
+    #[serde(default)]
     pub flag: Option<String>,
     /// Whether units are named by identifiers.
     matched: bool,
     /// A column that is not used and looks like independent units.
     pub unit_column: Option<String>,
     // Columns by role and what becomes of them, in which all catalogues agree.
+    #[serde(default)]
     kind: Vec<(String, String)>,
     design: Option<Design>,
     by_key: Option<bool>,
