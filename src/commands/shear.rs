@@ -12,7 +12,7 @@ use shearq_results::response::{Position, Shared, shears};
 ///
 /// Catalogues contain ellipticities e before the division by the response R to shear, because the response of one galaxy, or
 /// of an image with few, is noisy. `shear` writes g = ⟨R⟩⁻¹ e with the mean 2 × 2 response of all catalogues, so that the mean of
-/// g1 and g2 over any galaxies that are chosen by position is a shear. Galaxies that are chosen by a measured quantity need
+/// g1 and g2, weighted by w, over any galaxies that are chosen by position is a shear. Galaxies that are chosen by a measured quantity need
 /// `select` first. The table has `id`, positions and carried columns of the catalogues, set, image, g1, g2, w and flags; its
 /// metadata contain the response with its error.
 #[derive(Debug, Args)]

@@ -692,10 +692,12 @@ impl DetectionTask<'_> {
             other => other,
         })?;
         if found.is_empty() {
-            return Err(origin
-                .fault("no galaxy was detected (expected some)")
-                .hint("a lower --threshold, or check --noise")
-                .into());
+            let fault = match missing == sides[0] * sides[1] {
+                true => origin.fault("all pixels are missing (expected a few)"),
+                false => (origin.fault("no galaxy was detected (expected some)"))
+                    .hint("a lower --threshold, or check --noise"),
+            };
+            return Err(fault.into());
         }
         let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
         // Not before: a folder that a failed detection has claimed would refuse its remedies.

@@ -98,6 +98,8 @@ fn errors_are_the_scatter_of_repeated_trials() {
         (Definition::Leaderboard, kind(4, 0.054, true, 0.0)),
         (Definition::Leaderboard, kind(2, 0.107, true, 0.0)),
         (Definition::Leaderboard, kind(10, 0.03, false, 0.0)),
+        // The response is far from one and well known, so that the error of the noise is its own.
+        (Definition::Leaderboard, kind(4, 0.01, true, 1.0)),
         (Definition::Corrected, kind(4, 0.054, true, 0.0)),
     ] {
         for (name, ratio, share) in coverage(&grid, &kind, definition) {
