@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def test_wrong_arguments_are_named(arguments: dict[str, object], words: str) -> 
         shearq.detect(**{"image": np.zeros((60, 60)), "psf": STAR, **arguments})  # type: ignore[arg-type]
 
 
-def _wcs(matrix: list[list[float]], origin: tuple[float, float]) -> object:
+def _wcs(matrix: list[list[float]], origin: tuple[float, float]) -> Any:
     astropy_wcs = pytest.importorskip("astropy.wcs")
     wcs = astropy_wcs.WCS(naxis=2)
     wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
@@ -156,4 +157,4 @@ def test_exposures_of_one_sky_by_galsim() -> None:
 def test_wrong_lists_are_named(arguments: dict[str, object], words: str) -> None:
     frames = [_wcs([[-1.0, 0.0], [0.0, 1.0]], (30.5, 30.5))] * 2
     with pytest.raises(ValueError, match=words):
-        shearq.detect(**{"image": [np.zeros((60, 60))] * 2, "psf": STAR, "noise": 1.0, "wcs": frames, **arguments})  # type: ignore[arg-type]
+        shearq.detect(**{"image": [np.zeros((60, 60))] * 2, "psf": STAR, "noise": 1.0, "wcs": frames, **arguments})

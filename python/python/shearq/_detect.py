@@ -14,7 +14,7 @@ from ._catalogue import Catalogue
 from ._psf_models import PsfsOfModel, _doubts, _draw_of
 from ._threads import thread_count
 from ._warn import DataWarning, warn
-from ._wcs import WcsLike, jacobians
+from ._wcs import AstropyWcs, WcsLike, jacobians
 
 
 # Pixels a side of PSFs that are drawn: beyond them, a Moffat profile of β = 2.5 with a FWHM of 4 px has 1 % of its light.
@@ -45,7 +45,7 @@ def _places(first: Any, own: Any) -> Callable[[NDArray[np.float64]], NDArray[np.
 
         def of_astropy(places: NDArray[np.float64]) -> NDArray[np.float64]:
             world = first.pixel_to_world_values(*(places - 1.0).T)
-            return np.ascontiguousarray(np.stack(own.world_to_pixel_values(*world), axis=-1) + 1.0, dtype=np.float64)
+            return np.asarray(np.stack(own.world_to_pixel_values(*world), axis=-1) + 1.0, dtype=np.float64)
 
         return of_astropy
     if all(hasattr(wcs, "toWorld") for wcs in both):
@@ -76,7 +76,7 @@ def _pixels(image: Any, mask: Any) -> NDArray[np.float32]:
     return np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
 
 
-def _star(psf: Any, wcs: WcsLike | None) -> Any:
+def _star(psf: Any, wcs: Any) -> Any:
     """A stamp of the PSF, or a function that draws it."""
     draw = _draw_of(psf)
     if draw is not None:
@@ -93,7 +93,7 @@ def _level(noise: Any) -> float:
     return real("noise", noise, "a positive number of image units", least=0.0)
 
 
-def _local(wcs: WcsLike | None, pixels: NDArray[np.float32]) -> list[list[float]] | None:
+def _local(wcs: Any, pixels: NDArray[np.float32]) -> list[list[float]] | None:
     """The Jacobian of a WCS in the middle of an image."""
     rows, columns = pixels.shape
     return None if wcs is None else _jacobians(wcs, np.array([[(columns + 1) / 2, (rows + 1) / 2]]))[0].tolist()
@@ -105,7 +105,7 @@ def detect(
     *,
     noise: float | Sequence[float],
     mask: ArrayLike | Sequence[ArrayLike | None] | None = None,
-    wcs: WcsLike | None = None,
+    wcs: WcsLike | Sequence[AstropyWcs] | None = None,
     threshold: float = 6.0,
     threads: int | None = None,
 ) -> Catalogue:

@@ -24,6 +24,9 @@ const AXES_STEP_PX: f64 = 100.0;
 // Largest difference of the axes of an epoch between parts of the exposure that are one cell: it adds less to c (`MAX_DISTORTION` of
 // crates/pipeline/src/wcs.rs).
 const MAX_AXES_DIFFERENCE: f64 = 1e-4;
+// Error of a Gaussian of width σ between pixels by cubic polynomials along both axes, times σ⁴: (0.5 · 1.5)²/4! of its fourth derivatives, which
+// are 3/σ⁴ of the peak.
+const CUBIC_ERROR: f64 = 0.14;
 // Pixels that the map of a block may be beyond its corners and the middles of its sides.
 const MAP_SLACK_PX: f64 = 2.0;
 
@@ -112,6 +115,8 @@ pub struct EpochCells {
     pub(super) shared: Arc<Detector>,
     pub(super) sides: [usize; 2],
     pub(super) epochs: Vec<EpochPlan>,
+    /// Of interpolated v₀, in units of it.
+    pub(super) light_error: f64,
     pub(super) tiles_per_cell: [usize; 2],
     /// Cells and tiles of a row.
     pub(super) columns: [usize; 2],
@@ -178,9 +183,7 @@ impl EpochCells {
             let broadest = stars.iter().max_by(|a, b| sigma(a).total_cmp(&sigma(b)));
             let broadest = broadest.ok_or(MeasureError::DarkPsf(0.0));
             let broadest = broadest.map_err(&epoch.fault)?;
-            let scale = matrices
-                .first()
-                .map_or(1.0, |own| determinant(*own).abs().sqrt());
+            let scale = matrices.first().map_or(1.0, pixels_per_pixel);
             sigmas.push(sigma(broadest) / scale);
             is_constant &= epoch.is_constant && are_close(&matrices);
             first.get_or_insert_with(|| broadest.clone());
@@ -198,6 +201,7 @@ impl EpochCells {
         let mut cells = EpochCells {
             sides,
             epochs: Vec::new(),
+            light_error: 0.0,
             columns: [tiles[0].div_ceil(tiles_per_cell[0]), tiles[0]],
             tiles_per_cell,
             shared: Arc::new(shared),
@@ -209,6 +213,11 @@ impl EpochCells {
             .collect::<Vec<_>>();
         for (at, epoch) in epochs.into_iter().enumerate() {
             let plan = cells.plan(at == 0, epoch, &middles)?;
+            let smoothed = cells.shared.shared.lengths.detection_sigma;
+            for scale in plan.matrices.iter().flatten().map(pixels_per_pixel) {
+                let error = CUBIC_ERROR / (scale * smoothed).powi(4);
+                cells.light_error = cells.light_error.max(error);
+            }
             cells.epochs.push(plan);
         }
         Ok(cells)
@@ -402,6 +411,11 @@ impl EpochCells {
         }
         found
     }
+}
+
+/// Pixels of an epoch along a pixel of the first one.
+fn pixels_per_pixel(matrix: &Matrix2) -> f64 {
+    determinant(*matrix).abs().sqrt()
 }
 
 /// Whether the axes of an epoch are the same in all parts of the exposure.

@@ -1,5 +1,6 @@
 //! The detections of a tile, from the pixels of all epochs under it.
 
+use multiversion::multiversion;
 use shearq_measure::parts::ExposureDefects;
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::{apply, inverse};
@@ -14,9 +15,6 @@ use crate::weight::COUNT;
 // Of a bound, in standard deviations of v₀: four times what the cubic interpolation of its noise differs by at a FWHM of 3.5 px, by the fourth
 // derivatives of a Gaussian field.
 const SLACK: f64 = 0.15;
-// Of a bound, in v₀: what its interpolation differs by for a star with a FWHM of 2 px, by fourth derivatives.
-const SLACK_SHARE: f64 = 0.07;
-
 /// Buffers of a thread.
 #[derive(Debug, Default)]
 pub struct EpochScratch {
@@ -250,7 +248,7 @@ impl EpochCells {
                         *sum += half.own.weight / weight * half.light(at);
                     }
                 }
-                let slack = SLACK * known.light_noise + SLACK_SHARE * light.max(0.0);
+                let slack = SLACK * known.light_noise + self.light_error * light.max(0.0);
                 if !known.steps.may_count(light, neighbours, slack) {
                     continue;
                 }
@@ -276,17 +274,8 @@ impl Half<'_> {
 
     // Adds the light of a row of the first exposure.
     fn add(&self, line: &[[f64; 3]; 2], row: &mut [Sum]) {
-        let (side, weight) = (self.plan.transform.side, self.own.weight);
-        for (x, sum) in row.iter_mut().enumerate() {
-            let place = BlockMap::at(line, x as f64);
-            // A place beyond the patch is on its border, which is not covered.
-            let [column, of_row] = place.map(|at| (at as usize).min(side - 1));
-            if self.covered[of_row * side + column] {
-                sum.set |= 1 << self.at;
-                sum.weight += weight;
-                sum.light += weight * self.light(place);
-            }
-        }
+        let images = (self.light, self.covered, self.plan.transform.side);
+        add_light(images, line, (1 << self.at, self.own.weight), row);
     }
 
     fn light(&self, at: [f64; 2]) -> f64 {
@@ -307,6 +296,26 @@ impl Half<'_> {
         let pixels = &self.pixels[(y - before) * columns + x - before..];
         shift(pixels, columns, side, fractions, shifted);
         weighted_sums(&shifted[1], side, kernels, side)
+    }
+}
+
+/// Adds v₀ of an epoch, of which the bit and the weight are given, to the sums of a row.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_light(
+    (light, covered, side): (&[f32], &[bool], usize),
+    line: &[[f64; 3]; 2],
+    (bit, weight): (u64, f64),
+    row: &mut [Sum],
+) {
+    for (x, sum) in row.iter_mut().enumerate() {
+        let place = BlockMap::at(line, x as f64);
+        // A place beyond the patch is on its border, which is not covered.
+        let [column, of_row] = place.map(|at| (at as usize).min(side - 1));
+        if covered[of_row * side + column] {
+            sum.set |= bit;
+            sum.weight += weight;
+            sum.light += weight * near_value(light, side, place);
+        }
     }
 }
 
