@@ -119,9 +119,9 @@ const SAMPLE: usize = 4_000_000;
 const MAX_CORRELATION: f64 = 0.1;
 // The same of pixels that are as far apart as a correlation is measured.
 const MAX_FAR_CORRELATION: f64 = 0.1;
-// Pixels a side of a PSF over the σ of the Gaussian with its noise-equivalent area: without wings beyond 10 and 15 σ, m changes by +9 and +0.7
+// Pixels a side of a PSF over the σ of the Gaussian with its noise-equivalent area: without wings beyond 4.2 and 6.3 σ from the middle, m changes by +9 and +0.7
 // (10⁻³), behind a Moffat profile of β = 3.
-const MIN_PSF_SIGMAS: f64 = 13.0;
+const MIN_PSF_SIGMAS: f64 = 12.0;
 
 /// Noise of a stated level, with the correlation that was measured if pixels are clearly correlated.
 pub fn noise_of_level(sigma: f64, measured: Option<&StampNoise>) -> StampNoise {
@@ -1178,11 +1178,62 @@ mod tests {
         let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::ZERO);
         let star = psf.unwrap().stamp(48);
         let with_sky = &star + 3e-4;
-        let found = doubts(&[star, with_sky.clone(), with_sky], None, 1.0, None);
+        let found = doubts(
+            &[star, with_sky.clone(), with_sky],
+            None,
+            &StampNoise::white(1.0),
+            None,
+        );
         let [doubt] = &found[..] else {
             panic!("{found:?}")
         };
         assert!(doubt.contains("on 2 of 3 PSFs"), "{doubt}");
+    }
+
+    #[test]
+    fn noise_that_is_correlated_is_not_taken_as_white() {
+        let white = noise_image([700, 700]);
+        // The mean of two neighbours along x, and of six, in units of its scatter.
+        let mean = |count: usize| {
+            let scale = (count as f32).sqrt();
+            Array2::from_shape_fn((700, 700 - count), |(y, x)| {
+                (0..count).map(|k| white[[y, x + k]]).sum::<f32>() / scale
+            })
+        };
+        let of = |image: &Array2<f32>| {
+            let measured = noise_in(image.view()).unwrap();
+            let noise = noise_of_level(1.0, Some(&measured));
+            let star = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::ZERO);
+            let star = star.unwrap().stamp(48);
+            (
+                noise.correlation_along(1),
+                doubts(&[star], None, &noise, Some(&measured)),
+            )
+        };
+        assert_eq!(of(&white), (0.0, Vec::new()));
+        let (near, found) = of(&mean(2));
+        assert!((near - 0.5).abs() < 0.02, "{near}");
+        assert!(
+            found[0].contains("found 0.50 between neighbours"),
+            "{found:?}"
+        );
+        let (_, found) = of(&mean(6));
+        assert!(
+            found[0].contains("correlated over more than 3 px"),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn a_psf_without_wings_is_named() {
+        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::ZERO).unwrap();
+        let found = |side: usize| doubts(&[psf.stamp(side)], None, &StampNoise::white(1.0), None);
+        assert!(
+            found(16)
+                .iter()
+                .any(|own| own.contains("the PSF has 16 pixels a side"))
+        );
+        assert_eq!(found(24), [""; 0]);
     }
 
     #[test]

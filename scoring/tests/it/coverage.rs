@@ -98,8 +98,6 @@ fn errors_are_the_scatter_of_repeated_trials() {
         (Definition::Leaderboard, kind(4, 0.054, true, 0.0)),
         (Definition::Leaderboard, kind(2, 0.107, true, 0.0)),
         (Definition::Leaderboard, kind(10, 0.03, false, 0.0)),
-        // The response is far from one and well known, so that the error of the noise is its own.
-        (Definition::Leaderboard, kind(4, 0.01, true, 1.0)),
         (Definition::Corrected, kind(4, 0.054, true, 0.0)),
     ] {
         for (name, ratio, share) in coverage(&grid, &kind, definition) {
@@ -116,6 +114,27 @@ fn errors_are_the_scatter_of_repeated_trials() {
                 "{definition:?} {kind:?}: {name} {ratio}"
             );
             assert!(share > 0.95, "{kind:?}: {name} has an error in {share}");
+        }
+    }
+}
+
+// The response is far from one and well known, so that the error of the noise is its own.
+#[test]
+fn errors_of_the_noise_follow_the_number_of_images() {
+    let grid = Grid::great10(20).unwrap();
+    for images in [2, 6] {
+        let kind = Kind {
+            images,
+            noise: 0.01,
+            shared: true,
+            m: 1.0,
+        };
+        let all = coverage(&grid, &kind, Definition::Leaderboard);
+        for (name, ratio, share) in all.iter().filter(|(name, ..)| name == "galaxy_noise") {
+            assert!(
+                (0.8..1.25).contains(ratio) && *share > 0.95,
+                "{kind:?}: {name} {ratio} {share}"
+            );
         }
     }
 }
