@@ -216,3 +216,24 @@ fn exposures_of_one_sky_are_combined() {
         "--mask has 1 file for 2 exposures",
     );
 }
+
+#[test]
+fn detections_are_not_cut_by_what_shear_changes() {
+    let folder = Folder::new();
+    folder.run("simulate --scenes 1 --side 500 --density 60 --constant-shear 0.02,0 --out scene");
+    let detect = "detect --exposure scene/scene-001.fits --psf scene/psf.fits --out found";
+    folder.run(detect);
+    let mean = "mean found/set01/catalogue-001.parquet";
+    for cut in ["--where 'snr > 10'", "--columns w=selection"] {
+        folder.refuses(
+            &format!("{mean} {cut}"),
+            "the response of a cut or weight by their columns is not known",
+        );
+    }
+    folder.run(&format!("{mean} --where 'x < 250'"));
+    let twice = detect.replace("--psf", "scene/scene-001.fits --psf");
+    folder.refuses(
+        &twice.replace("found", "twice"),
+        "the same pixels as an earlier exposure",
+    );
+}

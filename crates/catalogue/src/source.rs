@@ -57,6 +57,25 @@ impl Reading<'_> {
         self.expressions().flat_map(|(_, own)| own.columns())
     }
 
+    // Whether rows count or weigh by a quantity that shear changes, in the names of shearq.
+    fn cuts(&self, columns: &Columns) -> bool {
+        let condition = self.condition().into_iter().flat_map(Expression::columns);
+        condition
+            .chain(columns.of(Role::Weight))
+            .any(changes_with_shear)
+    }
+
+    // Columns of expressions that shear changes by an unknown amount.
+    fn unanswered(&self, columns: &Columns, has_sheared: impl Fn(&str) -> bool) -> BTreeSet<&str> {
+        self.chosen_by()
+            .filter(|name| match columns.preset {
+                Preset::Shearq => changes_with_shear(name),
+                _ => !is_fixed(name, columns) && !has_sheared(name),
+            })
+            .filter(|name| !self.request.unsheared.iter().any(|own| own == name))
+            .collect()
+    }
+
     /// Whether rows 2k and 2k + 1 are a galaxy and its rotated image, which form a unit.
     pub fn rows_are_rotated_pairs(&self) -> bool {
         self.request.design == Some(Design::Rotated) && self.request.catalogues.len() == 1
@@ -859,14 +878,8 @@ fn source(
         given.check_true_shear(path)?;
     }
     let of_detections = columns.is_of_shearq() && are_of_detections(&names);
-    if of_detections {
-        let cuts = reading
-            .condition()
-            .into_iter()
-            .flat_map(Expression::columns);
-        if cuts.chain(columns.of(Role::Weight)).any(changes_with_shear) {
-            return Err(cut_of_detections(path));
-        }
+    if of_detections && reading.cuts(&columns) {
+        return Err(cut_of_detections(path));
     }
     let in_rows = sheared.is_some() || columns.of(Role::ShearedCatalogue).is_some();
     check_calibration(path, &columns, in_rows)?;
@@ -921,14 +934,7 @@ fn source(
     if let Some(unit) = unit {
         wanted.require(unit)?;
     }
-    let unanswered: BTreeSet<&str> = reading
-        .chosen_by()
-        .filter(|name| match columns.preset {
-            Preset::Shearq => changes_with_shear(name),
-            _ => !is_fixed(name, &columns) && !has_sheared(name),
-        })
-        .filter(|name| !reading.request.unsheared.iter().any(|own| own == name))
-        .collect();
+    let unanswered = reading.unanswered(&columns, has_sheared);
     let selection = match columns.is_of_shearq() {
         true => wanted.add("selection", None),
         false => None,
