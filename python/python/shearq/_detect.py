@@ -169,13 +169,13 @@ def detect(
             raise ValueError(f"wcs: found {given}; expected {count}, one for each exposure")
         masks = [None] * count if mask is None else _each("mask", mask, count)
         images = [_pixels(*pair) for pair in zip(image, masks)]
-        for at, own in enumerate(images):
-            if any(np.array_equal(own, other, equal_nan=True) for other in images[:at]):
-                raise ValueError(f"image: exposure {at} has the same pixels as an earlier one; expected each exposure once, with its own noise")
         stars = [_star(*pair) for pair in zip(_each("psf", psf, count), frames)]
         levels = [_level(own) for own in _each("noise", noise, count)]
         places = [_places(frames[0], own) for own in frames]
         local = _local(frames[0], images[0])
+        for at, own in enumerate(images):
+            if any(np.array_equal(own, other, equal_nan=True) for other in images[:at]):
+                raise ValueError(f"image: exposure {at + 1} has the same pixels as an earlier one; expected each exposure once, with its own noise")
         found, doubts = _shearq.detect_epochs(
             list(zip(images, stars, levels, places)), float(threshold), local, thread_count(threads)
         )
