@@ -8,9 +8,7 @@ use std::time::Instant;
 use clap::{ArgAction, ArgMatches};
 use serde_json::{Map, Value, json};
 use shearq_dataset::fingerprint;
-use shearq_files::FileError;
 use shearq_files::table::Place;
-use shearq_results::catalogues::Catalogues;
 
 use crate::{program, version_and_commit};
 
@@ -77,12 +75,6 @@ fn command_line(arguments: &[OsString]) -> String {
         }
     });
     format!("shearq{}", words.collect::<String>())
-}
-
-/// What the columns of catalogues are used as. They become part of the origin.
-pub(crate) fn account(catalogues: &Catalogues) -> Result<Vec<String>, FileError> {
-    remember_columns(catalogues.columns()?);
-    catalogues.account()
 }
 
 // The options of a command with their defaults, by name. Flags that were not given are left out.

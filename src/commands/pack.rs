@@ -6,7 +6,7 @@ use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_submissions::check_name;
 
 use crate::arguments::{SummaryArguments, named};
-use crate::origin::account;
+use crate::commands::score::account;
 use crate::progress::Bar;
 use crate::{count, tell, tell_notes, tell_unread};
 use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};

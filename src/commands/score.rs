@@ -9,7 +9,7 @@ use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of, split_columns,
 };
-use crate::origin::account;
+use crate::origin::remember_columns;
 use crate::{print_json, tell, tell_notes, tell_unread};
 use shearq_catalogue::columns::Shapes;
 use shearq_catalogue::foreign::Foreign;
@@ -19,6 +19,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::threads::Pool;
 use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
+use shearq_files::FileError;
 use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::catalogues::{ScoredUnits, Units};
@@ -196,6 +197,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Some(truth) => files(arguments, truth, options),
         None => catalogues(arguments, data, options),
     }
+}
+
+/// What the columns of catalogues are used as. They become part of the origin.
+pub(super) fn account(catalogues: &Catalogues) -> Result<Vec<String>, FileError> {
+    remember_columns(catalogues.columns()?);
+    catalogues.account()
 }
 
 fn options_of(arguments: &Arguments) -> Options {
