@@ -60,9 +60,9 @@ impl Reading<'_> {
     // Whether rows count or weigh by a quantity that shear changes, in the names of shearq.
     fn cuts(&self, columns: &Columns) -> bool {
         let condition = self.condition().into_iter().flat_map(Expression::columns);
-        condition
-            .chain(columns.of(Role::Weight))
-            .any(changes_with_shear)
+        let weight = columns.of(Role::Weight);
+        condition.into_iter().any(changes_with_shear)
+            || weight.is_some_and(|own| has_operand(own, changes_with_shear))
     }
 
     // Columns of expressions that shear changes by an unknown amount.
@@ -1278,14 +1278,15 @@ fn names_sheared(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result
     Ok(noshear && sheared || !others && (pair || are_clear))
 }
 
-// Whether shearq wrote a table. Those in memory and text have no metadata: a column decides that no other program writes, the
-// energy of the network.
+// Whether shearq wrote a table. Those in memory and text have no metadata: columns decide that no other program writes, the
+// energy of the network, or those of detections.
 fn is_own(place: &Place, frame: Option<&DataFrame>, names: &[String]) -> Result<bool, FileError> {
     let in_file = match frame {
         None => states_shearq(&place.path)?,
         Some(_) => None,
     };
-    Ok(in_file.unwrap_or_else(|| names.iter().any(|name| name == "first_energy")))
+    let by_columns = || are_of_detections(names) || names.iter().any(|name| name == "first_energy");
+    Ok(in_file.unwrap_or_else(by_columns))
 }
 
 /// Whether the metadata of a file state that shearq wrote it; `None` of text, which has none.

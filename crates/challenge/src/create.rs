@@ -276,6 +276,8 @@ pub fn of_scenes(
             side: settings.side,
             arcmin2: settings.area_arcmin2(),
             psf_varies: settings.psf_gradient != [0.0; 2],
+            epochs: (settings.epochs > 1).then_some(settings.epochs),
+            gain: settings.gain,
         }),
     };
     // The noise of the images is in the scatter that ranks entries, so that no error is smaller.

@@ -481,8 +481,9 @@ fn take_part(challenge: &Challenge) -> Vec<String> {
 
 // Bytes of the pixels of all images, in words.
 fn volume(data: &Data) -> String {
-    if let Some(SceneData { side, .. }) = data.scene {
-        let bytes = data.sets.len() * side * side * size_of::<f32>();
+    if let Some(SceneData { side, epochs, .. }) = data.scene {
+        let exposures = data.sets.len() * epochs.unwrap_or(1) as usize;
+        let bytes = exposures * side * side * size_of::<f32>();
         return format!("{:.0} MB of exposures, and their PSF", bytes as f64 / 1e6);
     }
     let pixels = data.galaxies() as f64 * (data.stamp * data.stamp) as f64;
@@ -506,10 +507,22 @@ fn scene_sections(challenge: &Challenge, scene: &SceneData) -> String {
             "model.psf",
         ),
     };
+    let gain = scene.gain.map_or_else(String::new, |gain| {
+        format!(", and that of the light at {gain} electrons per unit")
+    });
+    let (epochs, all) = match scene.epochs {
+        None => (String::new(), ""),
+        Some(epochs) => (
+            format!(
+                " Each scene has {epochs} exposures, turned and moved, with a WCS each: `scene-001-epoch-2.fits` and so on."
+            ),
+            "*",
+        ),
+    };
     format!(
         r"## Data
 
-* {about}: `scene-001.fits` and so on, with the sky subtracted and white noise of one per pixel. Galaxies lie anywhere and blend.
+* {about}: `scene-001.fits` and so on, with the sky subtracted and white noise of one per pixel{gain}. Galaxies lie anywhere and blend.{epochs}
 * {psf}.
 * Verify the download with `sha256sum -c SHA256SUMS`.
 
@@ -526,7 +539,7 @@ Put all catalogues into one folder, and this folder into a `.tar.gz` or `.zip`. 
 
 ```sh
 for n in $(seq {count}); do
-  shearq detect --exposure scene-$(printf %03d $n).fits --psf {model} --image $n --out ../detected
+  shearq detect --exposure scene-$(printf %03d $n){all}.fits --psf {model} --image $n --out ../detected
 done
 tar czf ../entry.tar.gz -C ../detected set01
 shearq challenge check ../entry.tar.gz --challenge .

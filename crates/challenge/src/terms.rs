@@ -71,6 +71,12 @@ pub struct SceneData {
     /// Whether the PSF varies over a scene.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub psf_varies: bool,
+    /// Exposures of a scene after the first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<u32>,
+    /// Electrons per unit, if light has noise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
 }
 
 impl Data {

@@ -149,10 +149,10 @@ impl StampNoise {
         }
     }
 
-    /// Larger of the correlations of pixels so far apart along the two axes.
+    /// The correlation of pixels so far apart along the axis along which it is larger, whatever its sign.
     pub fn correlation_along(&self, distance: i32) -> f64 {
-        self.correlation(distance, 0)
-            .max(self.correlation(0, distance))
+        let [x, y] = [(distance, 0), (0, distance)].map(|(dx, dy)| self.correlation(dx, dy));
+        if x.abs() > y.abs() { x } else { y }
     }
 
     /// Correlation of pixels (dx, dy) apart.

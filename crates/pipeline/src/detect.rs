@@ -115,8 +115,8 @@ const MAX_NOISE_DIFFERENCE: f64 = 0.05;
 // Most pixels that tell the sky of an exposure; those of the grid below are fewer.
 const SAMPLE: usize = 4_000_000;
 
-// Correlation of neighbouring pixels above which noise is not white. Undetected galaxies of 300 per arcmin² look like 0.02.
-const MAX_CORRELATION: f64 = 0.1;
+// Correlation of neighbouring pixels above which noise is not white. Undetected galaxies of 300 per arcmin² look like 0.04.
+const MAX_CORRELATION: f64 = 0.05;
 // The same of pixels that are as far apart as a correlation is measured.
 const MAX_FAR_CORRELATION: f64 = 0.1;
 // Pixels a side of a PSF over the σ of the Gaussian with its noise-equivalent area: without wings beyond 4.2 and 6.3 σ from the middle, m changes by +9 and +0.7
@@ -125,14 +125,14 @@ const MIN_PSF_SIGMAS: f64 = 12.0;
 
 /// Noise of a stated level, with the correlation that was measured if pixels are clearly correlated.
 pub fn noise_of_level(sigma: f64, measured: Option<&StampNoise>) -> StampNoise {
-    let clearly = measured.filter(|own| own.correlation_along(1) > MAX_CORRELATION);
+    let clearly = measured.filter(|own| own.correlation_along(1).abs() > MAX_CORRELATION);
     clearly.map_or_else(|| StampNoise::white(sigma), |own| own.at_level(sigma))
 }
 
 // What is doubtful about the noise of an exposure, which was `measured`, too.
 fn doubts_of_noise(noise: &StampNoise, measured: &StampNoise) -> Vec<String> {
     let [near, far] = [1, MAX_LAG as i32].map(|lag| measured.correlation_along(lag));
-    if far > MAX_FAR_CORRELATION {
+    if far.abs() > MAX_FAR_CORRELATION {
         return vec![format!(
             "the noise is correlated over more than {MAX_LAG} px (found {far:.2} at {MAX_LAG} px, expected 0), so that its level and the responses are wrong. Try: the image before it was smoothed or resampled"
         )];
@@ -145,7 +145,7 @@ fn doubts_of_noise(noise: &StampNoise, measured: &StampNoise) -> Vec<String> {
             "the noise is stated as {stated}, and measured as {own}: responses depend on it. Try: {own}"
         ));
     }
-    if near > MAX_CORRELATION {
+    if near.abs() > MAX_CORRELATION {
         doubts.push(format!(
             "pixels of the noise are correlated (found {near:.2} between neighbours, expected 0), as was measured and is used. Try: the image before it was resampled"
         ));
@@ -692,7 +692,8 @@ impl DetectionTask<'_> {
             other => other,
         })?;
         if found.is_empty() {
-            let fault = match missing == sides[0] * sides[1] {
+            let count = |own: &Opened<'_>| own.sides[0] * own.sides[1];
+            let fault = match missing == opened.iter().map(count).sum::<usize>() {
                 true => origin.fault("all pixels are missing (expected a few)"),
                 false => (origin.fault("no galaxy was detected (expected some)"))
                     .hint("a lower --threshold, or check --noise"),
@@ -839,7 +840,7 @@ impl<'a> EpochFiles<'a> {
         let mut exposure = Exposure::open(self.exposure)?;
         let sides = exposure.sides()?;
         let wcs = exposure.wcs()?;
-        let sample = sample(&mut exposure, sides)?;
+        let sample = sample(&mut self.pixels()?, sides)?;
         Ok(Opened {
             files: *self,
             sides,
@@ -981,12 +982,12 @@ fn grid(side: usize) -> impl Iterator<Item = usize> {
 }
 
 // Stamps of a grid over the exposure, one after the other.
-fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<f32>, PipelineError> {
+fn sample(pixels: &mut Pixels<'_>, sides: [usize; 2]) -> Result<Vec<f32>, PipelineError> {
     let mut stamps = Vec::new();
     for y in grid(sides[1]) {
         for x in grid(sides[0]) {
-            let place = (x as f64 + 0.5, y as f64 + 0.5);
-            stamps.extend(exposure.square::<f32>(place, NOISE_STAMP)?);
+            let origin = [x, y].map(|at| at as i64 - (NOISE_STAMP / 2) as i64);
+            stamps.extend(pixels.square(origin, NOISE_STAMP)?);
         }
     }
     Ok(stamps)

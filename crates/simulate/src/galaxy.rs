@@ -482,6 +482,24 @@ mod tests {
     }
 
     #[test]
+    fn galaxies_turn_from_x_to_y() {
+        let galaxy = Galaxy::bulge_and_disc(1.0, 0.5, 1.0, 2.0, Shear::new(0.3, 0.0)).unwrap();
+        let galaxy = galaxy.with_bulge_offset(2.0, 0.0).unwrap();
+        let turned = galaxy.turned(std::f64::consts::FRAC_PI_4);
+        let [bulge, disc] = turned.components() else {
+            panic!("{turned:?}")
+        };
+        for (found, expected) in [
+            (bulge.dx, 2f64.sqrt()),
+            (bulge.dy, 2f64.sqrt()),
+            (bulge.shape.e1, 0.0),
+            (disc.shape.e2, 0.3),
+        ] {
+            assert!((found - expected).abs() < 1e-12, "{turned:?}");
+        }
+    }
+
+    #[test]
     fn impossible_galaxies_are_refused() {
         let make = |flux, share, re| Galaxy::bulge_and_disc(flux, share, re, 4.8, Shear::ZERO);
         assert_eq!(make(1.0, 0.5, 0.0), Err(GalaxyError::Radius(0.0)));

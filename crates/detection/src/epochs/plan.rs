@@ -277,6 +277,13 @@ impl EpochCells {
             side = side.max(if is_touched { own } else { 1 });
             is_touched
         })?;
+        if plan.maps.iter().all(Option::is_none) {
+            return Err((epoch.fault)(MeasureError::Shape {
+                what: "the exposure",
+                found: "no pixels on the first one".into(),
+                expected: "some. Try: exposures of one sky".into(),
+            }));
+        }
         plan.transform = SquareTransform::new(fast_side(side));
         // Cells that the epoch does not touch need no functionals.
         let mut is_touched = vec![false; plan.matrices.len()];
