@@ -281,7 +281,7 @@ impl EpochCells {
             return Err((epoch.fault)(MeasureError::Shape {
                 what: "the exposure",
                 found: "no pixels on the first one".into(),
-                expected: "some. Try: exposures of one sky".into(),
+                expected: "some, as exposures of one sky have".into(),
             }));
         }
         plan.transform = SquareTransform::new(fast_side(side));
