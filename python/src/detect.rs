@@ -1,6 +1,6 @@
 //! Detections on an exposure.
 
-use ndarray::{ArrayView1, ArrayView2, s};
+use ndarray::{Array2, ArrayView1, ArrayView2, s};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -9,7 +9,8 @@ use shearq_dataset::threads::Quiet;
 use shearq_detection::{Cells, Detection, Epoch, EpochCells, MAX_EPOCHS, Patch};
 use shearq_measure::{DetectionMethod, Jacobian, MeasureError, StampNoise};
 use shearq_pipeline::detect::{
-    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, noise_in, noise_of_level, unlit_in_words,
+    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, noise_in, noise_of_level, square_of,
+    unlit_in_words,
 };
 
 use crate::errors::{of_measuring, of_pipeline};
@@ -50,13 +51,7 @@ pub(crate) fn detect<'py>(
             &noise_level,
             jacobian,
             &settings,
-            |places| {
-                let drawn = psf.call1((places.to_vec(),)).map_err(Fault)?;
-                let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>();
-                let drawn = drawn.map_err(Fault)?;
-                let stars = drawn.as_array();
-                Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
-            },
+            |places| drawn(&psf, places).map_err(Fault),
         ),
     };
     let cells = cells.map_err(|Fault(error)| error)?;
@@ -81,6 +76,14 @@ pub(crate) fn detect<'py>(
     );
     doubts.extend(unlit_in_words(unlit));
     Ok((columns(py, &found)?, doubts))
+}
+
+/// The stars that a function draws at places in FITS pixels.
+fn drawn(psf: &Bound<'_, PyAny>, places: &[(f64, f64)]) -> PyResult<Vec<Array2<f64>>> {
+    let drawn = psf.call1((places.to_vec(),))?;
+    let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>()?;
+    let stars = drawn.as_array();
+    Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
 }
 
 fn settings(threshold: f64) -> PyResult<DetectionMethod> {
@@ -149,22 +152,21 @@ pub(crate) fn detect_epochs<'py>(
     }
     let sides = |at: usize| [images[at].ncols(), images[at].nrows()];
     let measured: Vec<Option<StampNoise>> = images.iter().map(|image| noise_in(*image)).collect();
+    let stated = exposures.iter().map(|own| own.2).zip(&measured);
+    let levels: Vec<StampNoise> = stated
+        .map(|(sigma, measured)| noise_of_level(sigma, measured.as_ref()))
+        .collect();
     let mut epochs = Vec::new();
-    for (at, (_, psf, noise, places)) in exposures.iter().enumerate() {
+    for (at, (_, psf, _, places)) in exposures.iter().enumerate() {
         let star = psf.extract::<PyReadonlyArray2<'_, f64>>().ok();
         let star = star.map(|star| star.as_array().to_owned());
         epochs.push(Epoch {
             sides: sides(at),
-            noise: noise_of_level(*noise, measured[at].as_ref()),
+            noise: levels[at].clone(),
             is_constant: star.is_some(),
             stars: Box::new(move |places| match &star {
                 Some(star) => Ok(vec![star.clone(); places.len()]),
-                None => {
-                    let drawn = psf.call1((places.to_vec(),))?;
-                    let drawn = drawn.extract::<PyReadonlyArray3<'_, f64>>()?;
-                    let stars = drawn.as_array();
-                    Ok(stars.outer_iter().map(|star| star.to_owned()).collect())
-                }
+                None => drawn(psf, places),
             }),
             places: Box::new(move |on_first| {
                 let given: Vec<f64> = on_first.iter().flatten().copied().collect();
@@ -184,29 +186,16 @@ pub(crate) fn detect_epochs<'py>(
     }
     let cells = EpochCells::new(epochs, jacobian.as_ref(), &settings)?;
     let found = py.detach(|| {
-        let open = || {
-            Ok(|patch: &Patch| {
-                let image = &images[patch.epoch];
-                let pixel = |at: usize| {
-                    let [x, y] = [at % patch.side, at / patch.side].map(|at| at as i64);
-                    let at = [y + patch.origin[1], x + patch.origin[0]].map(usize::try_from);
-                    let [Ok(y), Ok(x)] = at else {
-                        return f32::NAN;
-                    };
-                    image.get([y, x]).copied().unwrap_or(f32::NAN)
-                };
-                Ok((0..patch.side * patch.side).map(pixel).collect())
-            })
-        };
+        let open =
+            || Ok(|patch: &Patch| Ok(square_of(images[patch.epoch], patch.origin, patch.side)));
         let threads = threads(threads_asked);
         shearq_pipeline::detect::detect_epochs(threads, &cells, sides(0), open, &mut Quiet)
     });
     let (found, [_, unlit]) = found.map_err(of_pipeline)?;
     let mut all = Vec::new();
     for (at, image) in images.iter().enumerate() {
-        let measured = measured[at].as_ref();
-        let noise = noise_of_level(exposures[at].2, measured);
-        let own = doubts(cells.stars(at), sky_of(image), &noise, measured);
+        let stars = cells.stars(at);
+        let own = doubts(stars, sky_of(image), &levels[at], measured[at].as_ref());
         all.extend(
             own.into_iter()
                 .map(|doubt| format!("exposure {}: {doubt}", at + 1)),

@@ -121,16 +121,16 @@ impl View<'_> {
             true => Cell::number(exact, own.decimals + 2),
             false => value(own),
         };
+        let exact_error = |error: f64, own: Published| match self.detail {
+            true => Cell::number(error, own.decimals + 2),
+            false => Cell::number(own.step, own.decimals),
+        };
         let (of_value, of_error) = key(metric);
         add(of_value, metric.label(), value(zero), &|standing| {
             exact(standing.best.value, standing.best.published)
         });
         add(of_error, "± error", Cell::Empty, &|standing| {
-            let own = standing.best.published;
-            match self.detail {
-                true => Cell::number(standing.best.error, own.decimals + 2),
-                false => Cell::number(own.step, own.decimals),
-            }
+            exact_error(standing.best.error, standing.best.published)
         });
         for other in [RankBy::QCalibrated, RankBy::M, RankBy::C] {
             let is_secret = self.open && !self.detail;
@@ -150,10 +150,7 @@ impl View<'_> {
             // A limit of m is compared with it.
             if self.challenge.data.scene.is_some() {
                 add(of_error, "±", Cell::Empty, &|standing| {
-                    of(standing).map_or(Cell::Empty, |(_, error, own)| match self.detail {
-                        true => Cell::number(error, own.decimals + 2),
-                        false => Cell::number(own.step, own.decimals),
-                    })
+                    of(standing).map_or(Cell::Empty, |(_, error, own)| exact_error(error, own))
                 });
             }
         }

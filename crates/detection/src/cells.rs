@@ -25,14 +25,36 @@ const WHOLE: [usize; 2] = [usize::MAX; 2];
 // moments. Chosen by hand.
 pub(crate) const PARTS: usize = 4;
 
+/// Which cells the tiles of an exposure are in, row by row.
+#[derive(Debug, Clone, Copy)]
+pub struct CellGrid {
+    pub(crate) tiles_per_cell: [usize; 2],
+    /// Cells of a row.
+    pub(crate) columns: usize,
+}
+
+impl CellGrid {
+    /// The cells that begin with a row of tiles; `None` if its tiles are in those of the row above.
+    pub fn beginning(&self, row: usize) -> Option<Range<usize>> {
+        let down = self.tiles_per_cell[1];
+        let first = row / down * self.columns;
+        row.is_multiple_of(down)
+            .then_some(first..first + self.columns)
+    }
+
+    /// Which of the cells of its row the tile `column` of a row is in.
+    pub fn column(&self, column: usize) -> usize {
+        column / self.tiles_per_cell[0]
+    }
+}
+
 /// The cells of an exposure, row by row.
 #[derive(Debug)]
 pub struct Cells {
     /// With the widths, margin and tiles of all.
     shared: Arc<Detector>,
     stars: Vec<Array2<f64>>,
-    tiles_per_cell: [usize; 2],
-    columns: usize,
+    grid: CellGrid,
 }
 
 impl Cells {
@@ -50,8 +72,10 @@ impl Cells {
         Ok(Cells {
             shared: Arc::new(detector),
             stars: vec![star],
-            tiles_per_cell: WHOLE,
-            columns: 1,
+            grid: CellGrid {
+                tiles_per_cell: WHOLE,
+                columns: 1,
+            },
         })
     }
 
@@ -87,8 +111,10 @@ impl Cells {
         Ok(Cells {
             shared: Arc::new(shared),
             stars,
-            tiles_per_cell: TILES_PER_CELL,
-            columns: sides[0].div_ceil(cell[0]),
+            grid: CellGrid {
+                tiles_per_cell: TILES_PER_CELL,
+                columns: sides[0].div_ceil(cell[0]),
+            },
         })
     }
 
@@ -97,27 +123,19 @@ impl Cells {
         &self.shared
     }
 
+    /// Which cells the tiles are in.
+    pub fn grid(&self) -> CellGrid {
+        self.grid
+    }
+
     /// The stars of all cells.
     pub fn stars(&self) -> &[Array2<f64>] {
         &self.stars
     }
 
-    /// The cells that begin with a row of tiles; `None` if its tiles are in those of the row above.
-    pub fn beginning(&self, row: usize) -> Option<Range<usize>> {
-        let down = self.tiles_per_cell[1];
-        let first = row / down * self.columns;
-        row.is_multiple_of(down)
-            .then_some(first..first + self.columns)
-    }
-
-    /// Which of the cells of its row the tile `column` of a row is in.
-    pub fn column(&self, column: usize) -> usize {
-        column / self.tiles_per_cell[0]
-    }
-
     /// The detector of a cell.
     pub fn detector(&self, cell: usize) -> Arc<Detector> {
-        match self.tiles_per_cell {
+        match self.grid.tiles_per_cell {
             WHOLE => Arc::clone(&self.shared),
             _ => Arc::new(self.shared.behind(&self.stars[cell])),
         }
@@ -183,10 +201,10 @@ mod tests {
         ];
         let mut count = 0;
         for row in 0..rows {
-            if let Some(own) = cells.beginning(row) {
+            if let Some(own) = cells.grid().beginning(row) {
                 assert_eq!(own.start, count);
                 count = own.end;
-                assert_eq!(cells.column(columns - 1) + 1, own.len());
+                assert_eq!(cells.grid().column(columns - 1) + 1, own.len());
             }
         }
         assert_eq!(count, cells.stars().len());

@@ -31,7 +31,7 @@ mod pixel;
 mod testing;
 mod weight;
 
-pub use cells::Cells;
+pub use cells::{CellGrid, Cells};
 pub use detector::{DetectionScratch, Detector, Tile};
 pub use epochs::{Epoch, EpochCells, EpochDetector, EpochScratch, MAX_EPOCHS, Patch};
 pub use groups::Detections;

@@ -123,9 +123,13 @@ const MAX_FAR_CORRELATION: f64 = 0.1;
 // (10⁻³), behind a Moffat profile of β = 3.
 const MIN_PSF_SIGMAS: f64 = 12.0;
 
+fn is_correlated(measured: &StampNoise) -> bool {
+    measured.correlation_along(1).abs() > MAX_CORRELATION
+}
+
 /// Noise of a stated level, with the correlation that was measured if pixels are clearly correlated.
 pub fn noise_of_level(sigma: f64, measured: Option<&StampNoise>) -> StampNoise {
-    let clearly = measured.filter(|own| own.correlation_along(1).abs() > MAX_CORRELATION);
+    let clearly = measured.filter(|own| is_correlated(own));
     clearly.map_or_else(|| StampNoise::white(sigma), |own| own.at_level(sigma))
 }
 
@@ -145,7 +149,7 @@ fn doubts_of_noise(noise: &StampNoise, measured: &StampNoise) -> Vec<String> {
             "the noise is stated as {stated}, and measured as {own}: responses depend on it. Try: {own}"
         ));
     }
-    if near.abs() > MAX_CORRELATION {
+    if is_correlated(measured) {
         doubts.push(format!(
             "pixels of the noise are correlated (found {near:.2} between neighbours, expected 0), as was measured and is used. Try: the image before it was resampled"
         ));
@@ -268,7 +272,7 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
             let mut bands = Bands::new(width, height, open()?);
             let mut detectors: Vec<Arc<Detector>> = Vec::new();
             for number in 0..height.div_ceil(shared.rows_per_tile()) {
-                if let Some(row) = cells.beginning(number) {
+                if let Some(row) = cells.grid().beginning(number) {
                     detectors = feeder
                         .ahead()
                         .map(row.collect(), |cell| cells.detector(cell));
@@ -276,7 +280,7 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
                 let tiles: Vec<Tile> = shared.tiles(width, number).collect();
                 let band = Arc::new(bands.of(&tiles[0])?);
                 for (at, tile) in tiles.iter().enumerate() {
-                    let detector = Arc::clone(&detectors[cells.column(at)]);
+                    let detector = Arc::clone(&detectors[cells.grid().column(at)]);
                     let job = (Arc::clone(&band), detector, *tile, at + 1 == tiles.len());
                     if !feeder.push(job) {
                         return Ok(());
@@ -321,14 +325,14 @@ pub fn detect_epochs<R: FnMut(&Patch) -> Result<Vec<f32>, PipelineError>>(
             let mut detectors: Vec<Arc<EpochDetector>> = Vec::new();
             let [columns, rows] = cells.tiles();
             for tile in (0..rows).flat_map(|y| (0..columns).map(move |x| [x, y])) {
-                if let Some(row) = cells.beginning(tile[1]).filter(|_| tile[0] == 0) {
+                if let Some(row) = cells.grid().beginning(tile[1]).filter(|_| tile[0] == 0) {
                     let ahead = feeder.ahead();
                     detectors = ahead.map(row.collect(), |cell| cells.detector(cell));
                 }
                 let patches = cells.patches(tile).into_iter();
                 let read = patches.map(|patch| Ok((patch, read(&patch)?)));
                 let patches = read.collect::<Result<Vec<_>, PipelineError>>()?;
-                let detector = Arc::clone(&detectors[cells.column(tile[0])]);
+                let detector = Arc::clone(&detectors[cells.grid().column(tile[0])]);
                 if !feeder.push((detector, tile, patches, tile[0] + 1 == columns)) {
                     return Ok(());
                 }
@@ -840,7 +844,8 @@ impl<'a> EpochFiles<'a> {
         let mut exposure = Exposure::open(self.exposure)?;
         let sides = exposure.sides()?;
         let wcs = exposure.wcs()?;
-        let sample = sample(&mut self.pixels()?, sides)?;
+        let mut pixels = self.pixels()?;
+        let sample = sample(sides, |origin| pixels.square(origin, NOISE_STAMP))?;
         Ok(Opened {
             files: *self,
             sides,
@@ -946,15 +951,15 @@ const MAX_LAG: usize = 3;
 
 // Noise of epochs is taken as independent.
 fn refuse_copies(opened: &[Opened<'_>]) -> Result<(), FileError> {
-    let bits = |own: &Opened<'_>| own.sample.iter().map(|pixel| pixel.to_bits()).collect();
-    let mut seen: Vec<Vec<u32>> = Vec::new();
-    for own in opened.iter().filter(|_| opened.len() > 1) {
-        let pixels = bits(own);
-        if seen.contains(&pixels) {
+    // Missing pixels are not numbers.
+    fn bits<'o>(own: &'o Opened<'_>) -> impl Iterator<Item = u32> + 'o {
+        own.sample.iter().map(|pixel| pixel.to_bits())
+    }
+    for (at, own) in opened.iter().enumerate() {
+        if opened[..at].iter().any(|other| bits(other).eq(bits(own))) {
             let message = "the same pixels as an earlier exposure (expected each exposure once)";
             return Err(own.origin.fault(message));
         }
-        seen.push(pixels);
     }
     Ok(())
 }
@@ -981,13 +986,17 @@ fn grid(side: usize) -> impl Iterator<Item = usize> {
     (step / 2..side).step_by(step)
 }
 
-// Stamps of a grid over the exposure, one after the other.
-fn sample(pixels: &mut Pixels<'_>, sides: [usize; 2]) -> Result<Vec<f32>, PipelineError> {
+// Stamps of a grid over an exposure, one after the other. `square` gives the pixels of one from its first pixel on.
+fn sample<E>(
+    sides: [usize; 2],
+    mut square: impl FnMut([i64; 2]) -> Result<Vec<f32>, E>,
+) -> Result<Vec<f32>, E> {
     let mut stamps = Vec::new();
     for y in grid(sides[1]) {
         for x in grid(sides[0]) {
-            let origin = [x, y].map(|at| at as i64 - (NOISE_STAMP / 2) as i64);
-            stamps.extend(pixels.square(origin, NOISE_STAMP)?);
+            stamps.extend(square(
+                [x, y].map(|at| at as i64 - (NOISE_STAMP / 2) as i64),
+            )?);
         }
     }
     Ok(stamps)
@@ -1003,19 +1012,23 @@ fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise,
     Ok(noise_of(stamps)?.ok_or_else(|| unmeasured(exposure))?)
 }
 
+/// The pixels of a square of an image (ny, nx) from the column and row `origin` on, NaN beyond the image.
+pub fn square_of(image: ArrayView2<'_, f32>, origin: [i64; 2], side: usize) -> Vec<f32> {
+    let pixel = |at: usize| {
+        let [x, y] = [at % side, at / side].map(|at| at as i64);
+        let [Ok(y), Ok(x)] = [y + origin[1], x + origin[0]].map(usize::try_from) else {
+            return f32::NAN;
+        };
+        image.get([y, x]).copied().unwrap_or(f32::NAN)
+    };
+    (0..side * side).map(pixel).collect()
+}
+
 /// The noise of an image (ny, nx), NaN where pixels are missing; `None` if it cannot be measured.
 pub fn noise_in(image: ArrayView2<'_, f32>) -> Option<StampNoise> {
-    let (height, width) = image.dim();
-    let mut stamps = Vec::new();
-    for y in grid(height) {
-        for x in grid(width) {
-            let around =
-                |at: usize| (0..NOISE_STAMP).map(move |k| (at + k).wrapping_sub(NOISE_STAMP / 2));
-            let pixels = around(y).flat_map(|y| around(x).map(move |x| [y, x]));
-            stamps.extend(pixels.map(|at| image.get(at).copied().unwrap_or(f32::NAN)));
-        }
-    }
-    noise_of(&stamps).ok()?
+    let square = |origin| Ok(square_of(image, origin, NOISE_STAMP));
+    let stamps = sample([image.ncols(), image.nrows()], square);
+    stamps.and_then(|stamps| noise_of(&stamps)).ok()?
 }
 
 // The noise of stamps one after the other; `None` if they do not show it.
@@ -1252,7 +1265,7 @@ mod tests {
         });
         let cells = cells.unwrap();
         let tiles = cells.shared().tiles(sides[0], 0);
-        let at = |column: usize, tile: Tile| (cells.column(column), tile.origin[0]);
+        let at = |column: usize, tile: Tile| (cells.grid().column(column), tile.origin[0]);
         let tiles: Vec<(usize, i64)> = tiles.enumerate().map(|(k, tile)| at(k, tile)).collect();
         let first = tiles.iter().find(|(column, _)| *column == 1).unwrap();
         let border = (first.1 - tiles[0].1) as usize;

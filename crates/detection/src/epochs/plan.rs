@@ -11,7 +11,7 @@ use shearq_quantities::statistics::upper_median;
 use shearq_submissions::DetectionMethod;
 
 use super::place::{BlockMap, TAPS};
-use crate::cells::{PARTS, TILES_PER_CELL, all_of_sum_one, middles};
+use crate::cells::{CellGrid, PARTS, TILES_PER_CELL, all_of_sum_one, middles};
 use crate::detector::Detector;
 use crate::functionals::{Axes, Functionals, SquareTransform, light_filter};
 use crate::weight::LIGHT;
@@ -117,9 +117,9 @@ pub struct EpochCells {
     pub(super) epochs: Vec<EpochPlan>,
     /// Of interpolated v₀, in units of it.
     pub(super) light_error: f64,
-    pub(super) tiles_per_cell: [usize; 2],
-    /// Cells and tiles of a row.
-    pub(super) columns: [usize; 2],
+    grid: CellGrid,
+    /// Tiles of a row.
+    columns: usize,
 }
 
 /// What an epoch is behind its PSF in a cell.
@@ -202,8 +202,11 @@ impl EpochCells {
             sides,
             epochs: Vec::new(),
             light_error: 0.0,
-            columns: [tiles[0].div_ceil(tiles_per_cell[0]), tiles[0]],
-            tiles_per_cell,
+            grid: CellGrid {
+                tiles_per_cell,
+                columns: tiles[0].div_ceil(tiles_per_cell[0]),
+            },
+            columns: tiles[0],
             shared: Arc::new(shared),
         };
         let cell = [0, 1].map(|k| tiles_per_cell[k] * tile[k]);
@@ -288,9 +291,9 @@ impl EpochCells {
         // Cells that the epoch does not touch need no functionals.
         let mut is_touched = vec![false; plan.matrices.len()];
         for (block, _) in plan.maps.iter().enumerate().filter(|own| own.1.is_some()) {
-            let [column, row] = [block % self.columns[1], block / self.columns[1] / 2];
-            let row = row / self.tiles_per_cell[1];
-            is_touched[row * self.columns[0] + self.column(column)] = true;
+            let [column, row] = [block % self.columns, block / self.columns / 2];
+            let row = row / self.grid.tiles_per_cell[1];
+            is_touched[row * self.grid.columns + self.grid.column(column)] = true;
         }
         for (matrix, is_touched) in plan.matrices.iter_mut().zip(is_touched) {
             *matrix = matrix.filter(|_| is_touched);
@@ -310,7 +313,7 @@ impl EpochCells {
         let mut points = Vec::new();
         let rows = 2 * self.sides[1].div_ceil(2 * inner);
         let firsts: Vec<[usize; 2]> = (0..rows)
-            .flat_map(|y| (0..self.columns[1]).map(move |x| [x * inner, y * inner]))
+            .flat_map(|y| (0..self.columns).map(move |x| [x * inner, y * inner]))
             .collect();
         for first in &firsts {
             let [x, y] = first.map(|at| at as f64 + 1.0);
@@ -355,22 +358,14 @@ impl EpochCells {
     /// Tiles along each row and column.
     pub fn tiles(&self) -> [usize; 2] {
         [
-            self.columns[1],
+            self.columns,
             self.sides[1].div_ceil(self.shared.rows_per_tile()),
         ]
     }
 
-    /// The cells that begin with a row of tiles; `None` if its tiles are in those of the row above.
-    pub fn beginning(&self, row: usize) -> Option<std::ops::Range<usize>> {
-        let down = self.tiles_per_cell[1];
-        let first = row / down * self.columns[0];
-        row.is_multiple_of(down)
-            .then_some(first..first + self.columns[0])
-    }
-
-    /// Which of the cells of its row the tile `column` of a row is in.
-    pub fn column(&self, column: usize) -> usize {
-        column / self.tiles_per_cell[0]
+    /// Which cells the tiles are in.
+    pub fn grid(&self) -> CellGrid {
+        self.grid
     }
 
     /// The detector of a cell.
@@ -399,7 +394,7 @@ impl EpochCells {
         let length = self.shared.columns_per_tile() as f64 - 1.0;
         let mut found = Vec::new();
         for half in 0..2 {
-            let block = (2 * row + half) * self.columns[1] + column;
+            let block = (2 * row + half) * self.columns + column;
             for (at, epoch) in self.epochs.iter().enumerate() {
                 let Some(map) = epoch.maps[block] else {
                     continue;
